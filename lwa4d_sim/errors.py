@@ -1,0 +1,48 @@
+"""Every error a user can cause, in one tree.
+
+LwaError
+├── ScenarioError (ValueError)    a scenario file or an override is wrong: says file, line, key, value, remedy
+├── ModelError (ValueError)       an MJCF file is not a serial arm with one motor a joint
+├── KinematicsError (ValueError)
+│   ├── ReachError                the target lies outside the workspace
+│   ├── SingularError             the target leaves a joint angle undefined
+│   └── JointLimitError           every branch of the inverse breaks a joint limit
+├── TrajectoryError (ValueError)  a motion that cannot be built from what was asked
+└── RecordError (OSError)         a record cannot be written or read
+"""
+
+
+class LwaError(Exception):
+    """Base of all errors that lwa4d_sim raises on purpose."""
+
+
+class ScenarioError(LwaError, ValueError):
+    """A scenario (file, override or variant) is not valid."""
+
+
+class ModelError(LwaError, ValueError):
+    """A model file cannot serve as an arm."""
+
+
+class KinematicsError(LwaError, ValueError):
+    """An inverse kinematics problem has no usable solution."""
+
+
+class ReachError(KinematicsError):
+    """The target lies outside the workspace."""
+
+
+class SingularError(KinematicsError):
+    """The target leaves a joint angle undefined."""
+
+
+class JointLimitError(KinematicsError):
+    """Every branch of the inverse breaks a joint limit."""
+
+
+class TrajectoryError(LwaError, ValueError):
+    """A motion cannot be built from what was asked."""
+
+
+class RecordError(LwaError, OSError):
+    """A record cannot be written or read."""

@@ -1,0 +1,158 @@
+"""The nouns of the project: signals that travel between blocks, and what a block must offer.
+
+Arrays have a leading axis of N simulations stepped together; a single run is N = 1. Shapes are given as
+``(N, n)`` with n joints. Units are SI on the link side; simulated time is integer nanoseconds.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple, NewType, Protocol
+
+import numpy as np
+from annotated_types import Ge, Gt
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Ns = NewType("Ns", int)  # simulated time [ns]
+
+Positive = Annotated[float, Gt(0)]
+NonNegative = Annotated[float, Ge(0)]
+Probability = Annotated[float, Ge(0), Gt(-1)]
+
+NS_PER_S = 1_000_000_000
+
+
+def to_ns(seconds: float) -> Ns:
+    """Seconds to the nearest nanosecond, the only place where time is rounded."""
+    return Ns(round(seconds * NS_PER_S))
+
+
+class Pose(NamedTuple):
+    """Where the tool is: ``x`` (..., 3) [m] and ``R`` (..., 3, 3), tool axes as columns, both in the base frame."""
+
+    x: Array
+    R: Array
+
+
+@dataclass(frozen=True, slots=True)
+class JointState:
+    """What the controller believes about the joints now: ``q`` [rad] and ``dq`` [rad/s], both (N, n)."""
+
+    q: Array
+    dq: Array
+
+
+@dataclass(frozen=True, slots=True)
+class JointReference:
+    """Desired joint motion: ``q`` [rad], ``dq`` [rad/s], ``ddq`` [rad/s^2], each (..., n)."""
+
+    q: Array
+    dq: Array
+    ddq: Array
+
+
+@dataclass(frozen=True, slots=True)
+class TaskReference:
+    """Desired tool motion in the base frame.
+
+    Attributes:
+        x, dx, ddx: tool point [m, m/s, m/s^2], each (..., 3).
+        R: tool orientation (..., 3, 3), or None when only the point is asked.
+        w, dw: angular velocity and acceleration [rad/s, rad/s^2], (..., 3), or None with ``R``.
+        posture: joint angles [rad], (..., n), that a redundant arm keeps in the null space, or None.
+    """
+
+    x: Array
+    dx: Array
+    ddx: Array
+    R: Array | None = None
+    w: Array | None = None
+    dw: Array | None = None
+    posture: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """What the drives latched: ``q`` (N, n) [rad] and, when a drive estimates it, ``dq`` (N, n) [rad/s].
+
+    ``stamp`` (N, n) [ns] is the instant each joint was sampled; joints may differ in age. A joint that has never been
+    heard of has stamp -1.
+    """
+
+    stamp: IntArray
+    q: Array
+    dq: Array | None
+
+
+class Trajectory(Protocol):
+    """A desired motion of one simulation, defined for every time (it rests after ``duration``)."""
+
+    @property
+    def duration(self) -> float:
+        """Length of the motion [s]."""
+        ...
+
+    @property
+    def knots(self) -> Array:
+        """End time of each segment [s], (segments,)."""
+        ...
+
+    def joint(self, t: Array) -> JointReference:
+        """Joint motion at the times ``t`` (K,) [s]; each field (K, n)."""
+        ...
+
+    def task(self, t: Array) -> TaskReference:
+        """Tool motion at the times ``t`` (K,) [s]; each field has leading axis K."""
+        ...
+
+
+class RigidBodyTerms(Protocol):
+    """Terms of M ddq + h = tau at one joint state, for N arms."""
+
+    @property
+    def M(self) -> Array:
+        """Inertia matrix (N, n, n) [kg m^2]."""
+        ...
+
+    @property
+    def h(self) -> Array:
+        """Coriolis, centrifugal and gravity torque (N, n) [N m]; at dq = 0 it is the gravity torque."""
+        ...
+
+    @property
+    def pose(self) -> Pose:
+        """Tool pose, (N, 3) and (N, 3, 3)."""
+        ...
+
+    @property
+    def J(self) -> Array:
+        """Tool Jacobian (N, 6, n), linear rows first."""
+        ...
+
+    def dJ_dq(self, dq: Array) -> Array:
+        """Bias acceleration dJ dq of the tool (N, 6) at joint speed ``dq`` (N, n)."""
+        ...
+
+
+class ArmModel(Protocol):
+    """What a controller believes about the arm."""
+
+    def at(self, q: Array, dq: Array | None = None) -> RigidBodyTerms:
+        """Terms at ``q`` and ``dq`` (N, n); without ``dq`` at rest. Valid until the next call."""
+        ...
+
+
+class Controller(Protocol):
+    """A control law. ``ref`` is a JointReference or a TaskReference, as the controller's ``space`` says."""
+
+    def torque(self, state: JointState, ref: Any, model: ArmModel) -> Array:
+        """Joint torque (N, n) [N m] before saturation."""
+        ...
+
+
+class Estimator(Protocol):
+    """Turns the newest measurement into the state the controller uses."""
+
+    def update(self, meas: Measurement, now: Ns) -> JointState:
+        """Called once per controller tick, at ``now``."""
+        ...
