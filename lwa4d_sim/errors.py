@@ -17,7 +17,16 @@ class LwaError(Exception):
 
 
 class ScenarioError(LwaError, ValueError):
-    """A scenario (file, override or variant) is not valid."""
+    """A scenario (file, override or variant) is not valid.
+
+    Args:
+        message: what is wrong and what would be valid.
+        key: dotted key it is about, when the raiser knows it better than the one who builds the block.
+    """
+
+    def __init__(self, message: str, key: str | None = None) -> None:
+        super().__init__(message)
+        self.key = key
 
 
 class ModelError(LwaError, ValueError):

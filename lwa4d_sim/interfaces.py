@@ -17,7 +17,6 @@ Ns = NewType("Ns", int)  # simulated time [ns]
 
 Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
-Probability = Annotated[float, Ge(0), Gt(-1)]
 
 NS_PER_S = 1_000_000_000
 
@@ -82,6 +81,21 @@ class Measurement:
     stamp: IntArray
     q: Array
     dq: Array | None
+
+
+@dataclass(frozen=True, slots=True)
+class Arrived:
+    """The newest data at an instant, joint by joint.
+
+    Attributes:
+        stamp: when each joint's datum was made [ns], (N, n); -1 where none has arrived.
+        since: when it arrived [ns], (N, n).
+        values: the data, each (N, n).
+    """
+
+    stamp: IntArray
+    since: IntArray
+    values: tuple[Array, ...]
 
 
 class Trajectory(Protocol):
@@ -155,4 +169,20 @@ class Estimator(Protocol):
 
     def update(self, meas: Measurement, now: Ns) -> JointState:
         """Called once per controller tick, at ``now``."""
+        ...
+
+
+class Channel(Protocol):
+    """One direction of the link."""
+
+    def send(self, stamp: Ns, values: tuple[Array, ...]) -> None:
+        """Put in data made at ``stamp``, arrays (N, n)."""
+        ...
+
+    def newest(self, now: Ns) -> Arrived | None:
+        """The newest data that has arrived by ``now``; None before the first."""
+        ...
+
+    def changes(self, after: Ns, before: Ns) -> list[Ns]:
+        """Instants strictly between ``after`` and ``before`` at which something arrives, in order."""
         ...

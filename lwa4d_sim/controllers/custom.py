@@ -1,0 +1,56 @@
+"""A user's own control law: a class on `sys.path`, named in the scenario as `package.module:Class`."""
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
+
+from lwa4d_sim.controllers.belief import Belief
+from lwa4d_sim.errors import ScenarioError
+from lwa4d_sim.interfaces import Controller
+
+
+@dataclass(frozen=True, kw_only=True)
+class CustomController:
+    """A class with a method `torque(state, ref, model)`; see docs/controllers.md.
+
+    Attributes:
+        kind: `package.module:Class`.
+        space: which reference it gets: a JointReference or a TaskReference.
+        model: what it believes about the arm.
+        options: every other key of the scenario's controller block, passed to the class by name.
+    """
+
+    __pydantic_config__: ClassVar[Any] = {"extra": "forbid", "allow_inf_nan": False}
+    kind: str
+    space: Literal["joint", "task"] = "joint"
+    model: Belief = Belief()
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def create(self) -> Controller:
+        """Import the class and make one.
+
+        Raises:
+            ScenarioError: no such module or class, wrong options, or no `torque` method.
+        """
+        made: Controller = load_object(self.kind, "controller.kind", self.options)
+        if not callable(getattr(made, "torque", None)):
+            raise ScenarioError(f"controller.kind: {self.kind} has no method torque(state, ref, model)")
+        return made
+
+
+def load_object(kind: str, key: str, options: Mapping[str, Any]) -> Any:
+    """An instance of the class named ``package.module:Class``, made with ``options``.
+
+    Raises:
+        ScenarioError: it cannot be imported or made; the message names ``key``.
+    """
+    module_name, _, class_name = kind.partition(":")
+    try:
+        factory = getattr(importlib.import_module(module_name), class_name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ScenarioError(f"{key} (={kind!r}): {error}; give package.module:Class, importable from here") from error
+    try:
+        return factory(**options)
+    except (TypeError, ValueError) as error:
+        raise ScenarioError(f"{key} (={kind!r}): cannot be made from {dict(options)}: {error}") from error

@@ -1,0 +1,186 @@
+"""Numbers from one run: how well it tracked, whether it shook, and what it asked of the drives."""
+
+import math
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lwa4d_sim.interfaces import NS_PER_S, Array
+
+if TYPE_CHECKING:
+    from lwa4d_sim.record import RunLog
+
+# What counts as shaking, all assumed; docs/validation.md shows where they lie against the shipped scenarios.
+SMOOTH_WINDOW = 0.4  # [s] motion that a cubic over this window follows is motion, the rest is vibration
+VIBRATION_FLOOR = 0.02  # [rad/s] rms below which nobody would see or hear it
+VIBRATION_LIMIT = 0.4  # [rad/s] rms that is unstable in any case: the rated speed of the slow joints
+DECAY = 0.9  # a vibration that keeps more than this from one window to the next does not decay
+SETTLED = 0.02  # of the segment's distance: the usual 2 % band
+
+#: name, unit and meaning of every metric, for reports and for the keys of `expect`
+METRICS: dict[str, tuple[str, str]] = {
+    "stable": ("", "no divergence and no vibration that fails to decay"),
+    "unstable_since": ("s", "onset of the instability, or none"),
+    "diverged_at": ("s", "instant at which the motion left all bounds, or none"),
+    "final_error": ("m", "distance of the tool from its reference at the end of each segment"),
+    "max_error": ("m", "largest distance of the tool from its reference"),
+    "rms_error": ("m", "root mean square of that distance"),
+    "settling_time": ("s", "time after which the tool stays within 2 % of each segment's distance, or none"),
+    "max_joint_error": ("rad", "largest joint error at the ticks, per joint"),
+    "rms_joint_error": ("rad", "root mean square joint error at the ticks, per joint"),
+    "velocity_error_rms": ("rad/s", "estimated minus true joint speed at the ticks, per joint"),
+    "peak_torque": ("N m", "largest applied torque, per joint"),
+    "torque_ripple": ("N m", "peak-to-peak applied torque in the last second, per joint"),
+    "peak_speed": ("rad/s", "largest joint speed, per joint"),
+    "vibration": ("rad/s", "rms joint speed faster than smooth motion at the end of each segment, worst joint"),
+    "saturation_fraction": ("", "share of joint-steps at the torque limit"),
+    "data_age_max": ("s", "largest age of the data the controller used"),
+    "deviation": ("m", "largest distance of the tool from the variant `ideal`, per segment (when there is one)"),
+}
+
+
+def metrics(log: "RunLog") -> dict[str, Any]:
+    """All metrics of one run; lists have an entry per segment or joint. Never NaN: what does not exist is None.
+
+    A run that diverged is measured up to that instant.
+    """
+    x, x_ref = log.x, log.x_ref
+    error = np.linalg.norm(x - x_ref, axis=1)
+    last = [log.step_at(end) for end in log.knots]
+    complete = [step < len(error) for step in last]
+    vibration, since = vibrations(log)
+    ticks = log.ticks
+    joint_error = ticks.q_ref - ticks.q_true
+    tail = log.tau[-min(len(log.tau), round(NS_PER_S / log.timestep)) :]
+    diverged = log.diverged_at
+    values: dict[str, Any] = {
+        "stable": diverged is None and since is None,
+        "unstable_since": since if since is not None else diverged,
+        "diverged_at": diverged,
+        # against the sample before the knot: a step reference jumps at the knot itself
+        "final_error": [
+            float(np.linalg.norm(x[k] - x_ref[k - 1])) if ok else None for k, ok in zip(last, complete, strict=True)
+        ],
+        "max_error": float(error.max()),
+        "rms_error": _rms(error),
+        "settling_time": _settling(log, x, x_ref),
+        "max_joint_error": _per_joint(np.abs(joint_error), np.max),
+        "rms_joint_error": _per_joint(joint_error**2, np.mean, np.sqrt),
+        "velocity_error_rms": _per_joint((ticks.dq - ticks.dq_true) ** 2, np.mean, np.sqrt),
+        "peak_torque": _per_joint(np.abs(log.tau), np.max),
+        "torque_ripple": _per_joint(tail, np.ptp),
+        "peak_speed": _per_joint(np.abs(log.dq), np.max),
+        "vibration": vibration,
+        "saturation_fraction": float(np.mean(np.abs(log.tau) >= log.tau_max)),
+        "data_age_max": float(ticks.age.max()) if ticks.age.size else None,
+    }
+    return values
+
+
+def deviation(log: "RunLog", other: "RunLog") -> list[float | None]:
+    """Largest distance [m] between the tool paths of two runs of one motion, per segment; None beyond either's end."""
+    n = min(len(log.q), len(other.q))
+    distance = np.linalg.norm(log.x[:n] - other.x[:n], axis=1)
+    out: list[float | None] = []
+    for start, end in _segments(log):
+        out.append(float(distance[start : end + 1].max()) if end < n else None)
+    return out
+
+
+def _segments(log: "RunLog") -> list[tuple[int, int]]:
+    ends = [log.step_at(end) for end in log.knots]
+    return list(zip([0, *ends[:-1]], ends, strict=True))
+
+
+def _settling(log: "RunLog", x: Array, x_ref: Array) -> list[float | None]:
+    """Per segment, the time from its start after which the tool stays in the band around the segment's end point."""
+    out: list[float | None] = []
+    for start, end in _segments(log):
+        if end >= len(x):
+            out.append(None)
+            continue
+        goal = x_ref[end - 1]
+        distance = np.linalg.norm(x[start : end + 1] - goal, axis=1)
+        band = SETTLED * float(distance[0])
+        outside = np.flatnonzero(distance > band)
+        if outside.size == 0:
+            out.append(0.0)
+        elif outside[-1] == end - start:
+            out.append(None)
+        else:
+            k = int(outside[-1])
+            share = (distance[k] - band) / (distance[k] - distance[k + 1])
+            out.append(float((k + share) * log.timestep / NS_PER_S))
+    return out
+
+
+def vibrations(log: "RunLog") -> tuple[list[float | None], float | None]:
+    """Vibration at the end of each segment [rad/s], worst joint, and the onset of instability [s] or None.
+
+    Vibration is what a cubic fitted over `SMOOTH_WINDOW` (Savitzky and Golay 1964) leaves of the joint speed. A segment
+    is unstable when, in its last second (or quarter), the vibration is above the floor and has not decayed against the
+    stretch before, or is above the limit anyway. The onset is the start of the stretch in which the running rms stays
+    above the floor.
+    """
+    # half a control period resolves every frequency the loop can have
+    stride = max(1, min(int(log.period // log.timestep) // 2, round(0.005 * NS_PER_S / log.timestep)))
+    h = stride * log.timestep / NS_PER_S
+    half = max(2, round(0.5 * SMOOTH_WINDOW / h))
+    signal = _detrended(log.dq[::stride], half)
+    power = (signal**2).max(axis=1)
+    values: list[float | None] = []
+    since: float | None = None
+    for start, end in _segments(log):
+        if end >= len(log.dq):
+            values.append(None)
+            continue
+        # the fit looks half a window ahead and must not see the next segment's jump
+        a, b = start // stride, max(start // stride + 8, end // stride - half)
+        window = max(2, min(round(1.0 / h), (b - a) // 4))
+        # per joint, so that a mode moving from one joint to another is not mistaken for decay
+        before = np.sqrt(np.mean(signal[b - 2 * window : b - window] ** 2, axis=0))
+        now = np.sqrt(np.mean(signal[b - window : b] ** 2, axis=0))
+        values.append(float(now.max()))
+        shaking = (now > VIBRATION_FLOOR) & (now > DECAY * before) | (now > VIBRATION_LIMIT)
+        if shaking.any() and since is None:
+            since = (a + _onset(power[a:b], window, h)) * h
+    return values, since
+
+
+def _onset(power: Array, window: int, h: float) -> int:
+    """First index after which the running mean of ``power`` stays above the floor to the end of the segment."""
+    width = max(1, min(round(0.2 / h), window))
+    running = np.convolve(power, np.full(width, 1.0 / width), mode="valid")
+    below = np.flatnonzero(running < VIBRATION_FLOOR**2)
+    return int(below[-1]) + 1 if below.size else 0
+
+
+def _detrended(signal: Array, half: int) -> Array:
+    """``signal`` (T, n) minus its cubic fit over 2 half + 1 samples; beyond the ends the end values go on."""
+    if len(signal) <= 2 * half:
+        return signal - signal.mean(axis=0)
+    padded = np.concatenate([np.repeat(signal[:1], half, 0), signal, np.repeat(signal[-1:], half, 0)])
+    kernel = _smoothing_kernel(half)
+    smooth = np.stack([np.convolve(column, kernel, mode="valid") for column in padded.T], axis=1)
+    return signal - smooth
+
+
+@lru_cache(maxsize=8)
+def _smoothing_kernel(half: int) -> Array:
+    """Weights of the value at the centre of a cubic least-squares fit over 2 half + 1 samples."""
+    u = np.arange(-half, half + 1) / half
+    kernel: Array = np.linalg.pinv(np.vander(u, 4, increasing=True))[0]
+    return kernel
+
+
+def _rms(values: Array) -> float:
+    return math.sqrt(float(np.mean(values**2)))
+
+
+def _per_joint(values: Array, reduce: Any, then: Any = None) -> list[float] | None:
+    if not len(values):
+        return None
+    out = reduce(values, axis=0)
+    result: list[float] = (out if then is None else then(out)).tolist()
+    return result

@@ -1,0 +1,196 @@
+"""The arm itself: N MuJoCo simulations stepped together under held torques, brakes and outside forces."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from lwa4d_sim.errors import ModelError
+from lwa4d_sim.interfaces import Array, NonNegative, Positive, to_ns
+
+# A joint this fast is no arm any more (assumed: about a thousand times the fastest joint of the LWA4D).
+SPEED_LIMIT = 1000.0  # [rad/s]
+# Divergence is looked for every this many plant steps: often enough to stop soon, seldom enough to cost nothing.
+CHECK_EVERY = 10
+
+_Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Disturbance:
+    """A force and torque on one body for a while, in world axes; a push is a short one.
+
+    Attributes:
+        at: start [s]; start and end are rounded up to plant steps.
+        duration: length [s]; without it to the end of the run.
+        force: [N], at the tool point or, with ``body``, at that body's centre of mass.
+        torque: [N m].
+        body: name of the body in the model; default the tool.
+    """
+
+    __pydantic_config__: ClassVar[Any] = {"extra": "forbid", "allow_inf_nan": False}
+    at: NonNegative
+    duration: Positive | None = None
+    force: _Vector = (0.0, 0.0, 0.0)
+    torque: _Vector = (0.0, 0.0, 0.0)
+    body: str | None = None
+
+
+class Plant:
+    """N arms of one structure.
+
+    Args:
+        models: one compiled model for all arms, or one per arm.
+        q0: start positions (N, n) [rad]; the arms start at rest.
+        disturbances: outside forces, the same for all arms.
+        threads: threads of the batch (0: all CPUs).
+    """
+
+    def __init__(
+        self,
+        models: mujoco.MjModel | Sequence[mujoco.MjModel],
+        q0: Array,
+        disturbances: Sequence[Disturbance] = (),
+        threads: int = 1,
+    ) -> None:
+        model = models if isinstance(models, mujoco.MjModel) else models[0]
+        self._batch = Batch(model, len(q0), threads)
+        if not isinstance(models, mujoco.MjModel):
+            self._batch.set_models(models)
+        self.timestep = to_ns(float(model.opt.timestep))
+        self.q, self.dq = self._batch.bind("qpos"), self._batch.bind("qvel")
+        self._ctrl, self._wrench = self._batch.bind("ctrl"), self._batch.bind("xfrc_applied")
+        self._warnings = self._batch.warning[:, :, 1]
+        self._disturbances = [_Window.of(disturbance, model, self.timestep) for disturbance in disturbances]
+        self._edges = sorted({edge for window in self._disturbances for edge in (window.first, window.last)})
+        self._step = 0
+        self._records: dict[int, dict[str, Array]] = {}
+        self._next_check = 0
+        self._none = np.zeros(len(q0), bool)
+        self.running = np.ones(len(q0), bool)
+        self.q[:] = q0
+        self.dq[:] = 0.0
+
+    def advance(self, tau: Array | None, steps: int) -> tuple[Array, Array]:
+        """Step all arms.
+
+        Args:
+            tau: torque (N, 1, n), held, or (N, steps, n), one per plant step [N m]. None closes all brakes; a NaN in a
+                row closes that arm's: an ideal brake, the arm stands still at once (assumed).
+            steps: number of plant steps.
+
+        Returns:
+            q and dq (N, steps, n) after each step. The arrays are reused by the next call.
+        """
+        edges = [edge - self._step for edge in self._edges if self._step < edge < self._step + steps]
+        self._apply_wrenches()
+        if not edges:
+            out = self._span(tau, steps)
+            self._step += steps
+            return out
+        pieces = []
+        for start, end in zip([0, *edges], [*edges, steps], strict=True):
+            part = tau[:, start:end] if tau is not None and tau.shape[1] > 1 else tau
+            pieces.append([a.copy() for a in self._span(part, end - start)])
+            self._step += end - start
+            self._apply_wrenches()
+        return np.concatenate([p[0] for p in pieces], axis=1), np.concatenate([p[1] for p in pieces], axis=1)
+
+    def diverged(self) -> Any:
+        """Mask (N,) of arms found to have left all bounds since the last call; they stand still from now on."""
+        if self._step < self._next_check:
+            return self._none
+        self._next_check = self._step + CHECK_EVERY
+        with np.errstate(invalid="ignore"):
+            lost = self.running & (
+                (self._warnings.sum(axis=1) > 0) | ~(np.abs(self.dq).max(axis=1) < SPEED_LIMIT)
+            )
+        if lost.any():
+            self.running &= ~lost
+            self.q[lost], self.dq[lost] = 0.0, 0.0
+        return lost
+
+    def _span(self, tau: Array | None, steps: int) -> tuple[Array, Array]:
+        """Steps without a change of wrench."""
+        q, dq = self._buffers(steps)
+        if tau is None:
+            self._brake(np.flatnonzero(self.running), 0, q, dq)
+            return q, dq
+        # a sum is the cheapest look for a NaN among few numbers
+        if np.isnan(tau.sum()) or not self.running.all():
+            self._mixed(np.broadcast_to(tau, (len(tau), steps, tau.shape[2])), q, dq)
+        elif tau.shape[1] == 1:
+            self._ctrl[:] = tau[:, 0]
+            if steps == 1:
+                self._batch.step()
+                q[:, 0], dq[:, 0] = self.q, self.dq
+            else:
+                self._batch.rollout(steps, record=("qpos", "qvel"), out=self._records[steps])
+        else:
+            self._batch.rollout(steps, tau, record=("qpos", "qvel"), out=self._records[steps])
+        return q, dq
+
+    def _mixed(self, tau: Array, q: Array, dq: Array) -> None:
+        """Some arms braked or lost: runs of equal state, arm by arm groups."""
+        steps = tau.shape[1]
+        braked = np.isnan(tau).any(axis=2)
+        start = 0
+        changes = np.flatnonzero((braked[:, 1:] != braked[:, :-1]).any(axis=0)) + 1
+        for end in [*changes.tolist(), steps]:
+            held = braked[:, start] & self.running
+            free = ~braked[:, start] & self.running
+            if held.any():
+                self._brake(np.flatnonzero(held), start, q[:, :end], dq[:, :end])
+            if free.any():
+                ids = np.flatnonzero(free)
+                out = self._batch.rollout(end - start, tau[ids, start:end], record=("qpos", "qvel"), ids=ids)
+                q[ids, start:end], dq[ids, start:end] = out["qpos"], out["qvel"]
+            lost = ~self.running
+            q[lost, start:end], dq[lost, start:end] = self.q[lost][:, None], 0.0
+            start = end
+
+    def _brake(self, ids: Any, start: int, q: Array, dq: Array) -> None:
+        self.dq[ids] = 0.0
+        q[ids, start:] = self.q[ids][:, None]
+        dq[ids, start:] = 0.0
+
+    def _buffers(self, steps: int) -> tuple[Array, Array]:
+        if steps not in self._records:
+            shape = (self.q.shape[0], steps, self.q.shape[1])
+            self._records[steps] = {"qpos": np.zeros(shape), "qvel": np.zeros(shape)}
+        record = self._records[steps]
+        return record["qpos"], record["qvel"]
+
+    def _apply_wrenches(self) -> None:
+        if not self._disturbances:
+            return
+        self._wrench[:] = 0.0
+        for window in self._disturbances:
+            if window.first <= self._step < window.last:
+                self._wrench[:, window.body] += window.wrench
+
+
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """A disturbance on the plant's grid: steps first <= k < last."""
+
+    first: int
+    last: int
+    body: int
+    wrench: Array
+
+    @staticmethod
+    def of(disturbance: Disturbance, model: mujoco.MjModel, timestep: int) -> "_Window":
+        name = disturbance.body or "tool"
+        body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+        if body < 0:
+            names = [model.body(i).name for i in range(1, model.nbody)]
+            raise ModelError(f"disturbance: no body '{name}' in the model; its bodies are {', '.join(names)}")
+        first = -(-to_ns(disturbance.at) // timestep)
+        last = np.iinfo(np.int64).max
+        if disturbance.duration is not None:
+            last = -(-to_ns(disturbance.at + disturbance.duration) // timestep)
+        return _Window(int(first), int(last), body, np.array([*disturbance.force, *disturbance.torque]))

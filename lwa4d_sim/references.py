@@ -1,0 +1,51 @@
+"""The desired motion as the loop needs it: sampled in blocks of ticks, stacked over simulations."""
+
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any, Literal
+
+import numpy as np
+
+from lwa4d_sim.interfaces import NS_PER_S, Array, JointReference, Ns, TaskReference, Trajectory
+
+_BLOCK = 512  # ticks sampled at a time: one vectorised call instead of many small ones, and bounded memory
+
+
+class ReferenceBlocks:
+    """References of N simulations at the instants of computation.
+
+    Args:
+        trajectories: one for each simulation, or a single one for all.
+        space: joint or task.
+        period: control period [ns].
+        offset: from tick to the instant the reference is taken [s].
+        ticks: number of ticks.
+    """
+
+    def __init__(
+        self, trajectories: Sequence[Trajectory], space: Literal["joint", "task"], period: Ns, offset: float, ticks: int
+    ) -> None:
+        self._trajectories, self._space = trajectories, space
+        self._period, self._offset, self._ticks = period / NS_PER_S, offset, ticks
+        self._type: Any = JointReference if space == "joint" else TaskReference
+        self._start = -_BLOCK
+        self._columns: list[Array | None] = []
+
+    def at(self, k: int) -> Any:
+        """Reference of tick ``k``; fields have leading axis N, or 1 when all simulations share the motion."""
+        i = k - self._start
+        if not 0 <= i < _BLOCK:
+            self._sample(k)
+            i = 0
+        return self._type(*[None if column is None else column[i] for column in self._columns])
+
+    def _sample(self, k: int) -> None:
+        t = np.arange(k, min(k + _BLOCK, self._ticks)) * self._period + self._offset
+        sampled = [
+            trajectory.joint(t) if self._space == "joint" else trajectory.task(t) for trajectory in self._trajectories
+        ]
+        self._start = k
+        self._columns = []
+        for field in fields(self._type):
+            parts = [getattr(one, field.name) for one in sampled]
+            self._columns.append(None if parts[0] is None else np.stack(parts, axis=1))
