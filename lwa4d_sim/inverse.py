@@ -57,8 +57,7 @@ class ClosedFormKinematics(SerialKinematics):
             JointLimitError: no branch lies within the joint limits, whole turns considered.
             KinematicsError: ``R``, ``elbow`` or ``arm_angle`` does not suit the arm.
         """
-        if elbow not in ("up", "down"):
-            raise KinematicsError(f"elbow (={elbow!r}) must be 'up' or 'down'")
+        _require_elbow(elbow)
         x, near = np.asarray(x, dtype=float), None if near is None else self._joints(near)
         return self._choose(x, self._branches(x, R, elbow, arm_angle, near), near)
 
@@ -83,16 +82,16 @@ class ClosedFormKinematics(SerialKinematics):
         Arguments and errors as ``ik``, with ``near`` (n,) for the first sample. Joints that a sample leaves undefined
         keep the angles of the sample before. Joints jump only where the path forces them to, at a limit or singularity.
         """
+        _require_elbow(elbow)
         x = np.asarray(x, dtype=float)
         psi = np.broadcast_to(np.asarray(arm_angle, dtype=float), x.shape[:-1])
-        orientations = None if R is None else np.asarray(R, dtype=float)
+        Rs = None if R is None else np.broadcast_to(np.asarray(R, dtype=float), (len(x), 3, 3))
         branches, code = self._solve(x, R, elbow, arm_angle, None)
         q = np.empty((len(x), self.n))
         last = None if near is None else self._joints(near)
         for k in range(len(x)):
             if code[k]:
-                Rk = None if orientations is None else orientations[k]
-                q[k] = self.ik(x[k], Rk, elbow=elbow, arm_angle=psi[k], near=last)
+                q[k] = self.ik(x[k], None if Rs is None else Rs[k], elbow=elbow, arm_angle=psi[k], near=last)
             else:
                 q[k] = self._choose(x[k], branches[k], last)
             last = q[k]
@@ -141,6 +140,11 @@ class ClosedFormKinematics(SerialKinematics):
             f"{what}: joint {self.chain.names[joint]!r} (={q[branch, joint]:.6g} rad) must be in "
             f"[{self.lower[joint]:.6g}, {self.upper[joint]:.6g}], and that is the closest of {len(q)} branches"
         )
+
+
+def _require_elbow(elbow: str) -> None:
+    if elbow not in ("up", "down"):
+        raise KinematicsError(f"elbow (={elbow!r}) must be 'up' or 'down'")
 
 
 def wrap(angle: Array) -> Array:

@@ -12,6 +12,8 @@ from lwa4d_sim.errors import KinematicsError, ReachError, SingularError
 from lwa4d_sim.interfaces import Array, IntArray
 from lwa4d_sim.inverse import ClosedFormKinematics
 
+__all__ = ["Chain", "Lwa3Kinematics", "SerialKinematics", "SrsKinematics", "kinematics_for"]
+
 SHAPE = 1e-9  # [m, rad] a chain this close to the ideal shape gets the closed form, which is then as exact
 LENGTH = 1e-9  # [m] a target this far beyond reach is at its edge, and this near an axis on it: far below any encoder
 SINE = 1e-9  # two roll axes at a smaller angle count as one: the choice between them moves the tool by less than 1e-9 m
@@ -28,8 +30,8 @@ class Lwa3Kinematics(ClosedFormKinematics):
         t3 = ±2 atan2(sqrt((L2 + L3)^2 - d^2), sqrt(d^2 - (L2 - L3)^2)),  d^2 = r^2 + h^2
         t2 = atan2(-h, r) - atan2(L3 sin t3, L2 + L3 cos t3),  q1 = atan2(y, x)
 
-    Elbow "up" is the + branch. ``ik_branches`` gives up and down, in this order. A solution that leans back over the
-    shoulder (r < 0) is not sought. On the axis of joint 1 that joint is undefined.
+    Elbow "up", along axis 1, is the + branch. ``ik_branches`` gives up and down, in this order. A solution that leans
+    back over the shoulder (r < 0) is not sought. On the axis of joint 1 that joint is undefined.
 
     Args:
         chain: the arm.
@@ -79,11 +81,11 @@ class SrsKinematics(ClosedFormKinematics):
 
         e = cos(psi) e0 + sin(psi) u × e0
 
-    is the direction from that line to the elbow, and e0 the part of axis 1 (upwards) perpendicular to u. So psi = 0 has
-    the elbow in the vertical plane of shoulder and wrist, above the line, psi = pi has it below, and psi > 0 turns it
-    right-handed about u. Where u is within 1e-6 rad of axis 1, e0 is the part of the front direction (axis 2 × axis 1
-    at q = 0: the base x axis) instead: psi = 0 then has the elbow in front. A straight elbow counts as one about to
-    bend in its positive sense.
+    is the direction from that line to the elbow, and e0 the part of "up" perpendicular to u; up is the way the arm
+    points at q = 0, along axis 1. So psi = 0 has the elbow in the vertical plane of shoulder and wrist, above the line,
+    psi = pi has it below, and psi > 0 turns it right-handed about u. Where u is within 1e-6 rad of axis 1, e0 is the
+    part of the front direction (axis 2 × up at q = 0: the base x axis) instead: psi = 0 then has the elbow in front. A
+    straight elbow counts as one about to bend in its positive sense.
 
     ``ik_branches`` gives 8 branches, number 4 shoulder + 2 elbow + wrist, each 0 for a positive and 1 for a negative
     angle of joint 2, 4, 6 (counted right-handed about axis 2 at q = 0). The elbow is at the same point in all of them.
@@ -101,12 +103,14 @@ class SrsKinematics(ClosedFormKinematics):
         if self.n != 7 or chain.slide.any():
             raise KinematicsError(f"this inverse needs 7 turning joints; the chain has {chain.names}")
         f = self.frames(np.zeros(7))
-        self._B, self._shoulder, off = _shoulder_frame(f, 3)
+        B, self._shoulder, off = _shoulder_frame(f, 3)
+        elbow, off_elbow = _meeting_point(f.z[2:5], f.a[2:5])
+        wrist, off_wrist = _meeting_point(f.z[4:7], f.a[4:7])
+        along = np.sign((elbow - self._shoulder) @ B[:, 2])  # -1 where axis 1 points from the elbow to the base
+        self._B = B * [along, 1.0, along]
         up, side = self._B[:, 2], self._B[:, 1]
         ideal = np.array([up, side, up, side, up, side, up])
         self._sign = np.sign((f.z * ideal).sum(-1))
-        elbow, off_elbow = _meeting_point(f.z[2:5], f.a[2:5])
-        wrist, off_wrist = _meeting_point(f.z[4:7], f.a[4:7])
         off = max(off, off_elbow, off_wrist, float(np.abs(f.z - self._sign[:, None] * ideal).max()))
         self._upper_arm, self._forearm = float((elbow - self._shoulder) @ up), float((wrist - elbow) @ up)
         if not (off < SHAPE < min(self._upper_arm, self._forearm)):

@@ -230,7 +230,7 @@ def _edit_masses(spec: mujoco.MjSpec, model: mujoco.MjModel, scale: Array, paylo
 
     Merging, rather than adding a body, leaves the model's structure as it was: a batch may mix payloads.
     """
-    spec.compiler.settotalmass = -1
+    spec.compiler.settotalmass = -1  # this and the next would undo the edit
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     bodies = {body.id: body for body in spec.bodies}
     for link, factor in zip(model.jnt_bodyid, scale, strict=True):

@@ -29,6 +29,7 @@ class Scenario:
         variants: settings of each variant, in the file's order.
         expect: expectations of each variant.
         document: the whole document with overrides.
+        overrides: values by dotted key, as given.
     """
 
     name: str
@@ -39,7 +40,7 @@ class Scenario:
     expect: Mapping[str, Mapping[str, Any]]
     document: Mapping[str, Any]
     _lines: Mapping[KeyPath, int] = field(repr=False)
-    _overrides: tuple[str, ...] = ()
+    overrides: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod
     def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> "Scenario":
@@ -84,7 +85,7 @@ class Scenario:
             expect={},
             document=document,
             _lines=lines,
-            _overrides=tuple(overrides or ()),
+            overrides=dict(overrides or {}),
         )
         made._check_top()
         variants = {name: made._settings(name) for name in made._variant_names()}
@@ -171,7 +172,7 @@ class Scenario:
     def _where(self, path: KeyPath, variant: str | None) -> str:
         """File and line of a key, or of the nearest key above it; overrides have no line."""
         key = dotted(path)
-        if any(key == o or key.startswith(o + ".") for o in self._overrides):
+        if any(key == o or key.startswith(o + ".") for o in self.overrides):
             return f"{self.source} with {key} overridden"
         full = [("variants", variant, *path[:cut]) for cut in range(len(path), 0, -1)] if variant else []
         plain = [path[:cut] for cut in range(len(path), 0, -1)]

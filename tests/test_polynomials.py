@@ -49,8 +49,8 @@ def test_boundary_values_of_a_polynomial_give_it_back() -> None:
     rng = np.random.default_rng(1)
     for d in range(1, 5):
         c = rng.normal(size=(2 * d, 3))
-        ends = [np.array([np.polynomial.polynomial.polyval(t, np.polynomial.polynomial.polyder(c, k)) for k in range(d)])
-                for t in (0.0, 1.7)]  # fmt: skip
+        derivatives = [np.polynomial.polynomial.polyder(c, k) for k in range(d)]
+        ends = [[np.polynomial.polynomial.polyval(t, dc) for dc in derivatives] for t in (0.0, 1.7)]
         np.testing.assert_allclose(boundary_polynomial(1.7, *ends), c, atol=1e-11)
 
 

@@ -1,0 +1,137 @@
+"""Many scenarios on many processes: outcomes in the order asked, a JUnit file, and one bad file never stops the rest."""
+
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from lwa4d_sim.errors import LwaError, RecordError, ScenarioError
+from lwa4d_sim.results import passed, run_scenario
+from lwa4d_sim.scenario import Scenario
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One scenario's outcome: a summary, or the one line that says why there is none."""
+
+    file: Path
+    seconds: float
+    summary: dict[str, Any] | None
+    error: str | None = None
+
+    @property
+    def verdict(self) -> str:
+        """passed, failed or error."""
+        if self.summary is None:
+            return "error"
+        return "passed" if passed(self.summary) else "failed"
+
+
+def find_scenarios(places: Sequence[Path]) -> list[Path]:
+    """Scenario files: each file given, and every .yaml and .yml directly in each folder given.
+
+    Raises:
+        ScenarioError: a place does not exist, or a folder holds no scenario.
+    """
+    files: list[Path] = []
+    for place in places:
+        if place.is_dir():
+            found = sorted(p for p in place.iterdir() if p.suffix in (".yaml", ".yml") and p.is_file())
+            if not found:
+                raise ScenarioError(f"{place}: holds no .yaml file")
+            files += found
+        elif place.exists():
+            files.append(place)
+        else:
+            raise ScenarioError(f"{place}: no such file or folder")
+    return list(dict.fromkeys(files))
+
+
+def run_files(files: Sequence[Path], out: Path | None, *, plots: bool, workers: int) -> Iterator[Job]:
+    """Run scenario files on ``workers`` processes; yields outcomes in the order of ``files``."""
+    if workers <= 1 or len(files) <= 1:
+        yield from (_run_file(file, out, plots) for file in files)
+        return
+    # spawned, because a forked copy of a process with running threads may hang
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(workers, len(files)), mp_context=context) as pool:
+        futures: list[Future[Job]] = [pool.submit(_run_file, file, out, plots) for file in files]
+        try:
+            for file, future in zip(files, futures, strict=True):
+                try:
+                    yield future.result()
+                except Exception as error:  # a killed worker, or out of memory: the file's outcome, not the batch's end
+                    yield Job(file, 0.0, None, f"{file}: the worker died ({error or type(error).__name__})")
+        except GeneratorExit:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _run_file(file: Path, out: Path | None, plots: bool) -> Job:
+    start = time.perf_counter()
+    try:
+        summary = run_scenario(Scenario.load(file), out, plots=plots)
+    except LwaError as error:
+        return Job(file, time.perf_counter() - start, None, str(error))
+    return Job(file, time.perf_counter() - start, summary)
+
+
+def default_workers() -> int:
+    """Processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def write_junit(path: Path, jobs: Sequence[Job]) -> None:
+    """JUnit XML: a suite per file, a case per variant; failed expectations are failures, bad input is an error.
+
+    Raises:
+        RecordError: the file cannot be written.
+    """
+    root = ElementTree.Element("testsuites", name="lwa4d-sim")
+    for job in jobs:
+        cases = [] if job.summary is None else list(job.summary["variants"].items())
+        suite = ElementTree.SubElement(
+            root,
+            "testsuite",
+            name=str(job.file),
+            tests=str(max(1, len(cases))),
+            failures=str(sum(not variant["expect"]["passed"] for _, variant in cases)),
+            errors=str(int(job.summary is None)),
+            time=f"{job.seconds:.3f}",
+        )
+        if job.summary is None:
+            case = ElementTree.SubElement(suite, "testcase", classname=job.file.stem, name="load")
+            ElementTree.SubElement(case, "error", message=_printable(job.error or ""))
+        for name, variant in cases:
+            case = ElementTree.SubElement(suite, "testcase", classname=job.file.stem, name=name)
+            broken = [describe(check) for check in variant["expect"]["checks"] if not check["passed"]]
+            if broken:
+                ElementTree.SubElement(case, "failure", message=_printable("; ".join(broken)))
+    partial = path.with_name(path.name + ".part")
+    try:
+        ElementTree.ElementTree(root).write(partial, encoding="utf-8", xml_declaration=True)
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise RecordError(f"{path}: cannot write the JUnit file ({error.strerror})") from error
+
+
+def describe(check: dict[str, Any]) -> str:
+    """One checked expectation in words: what was asked and what was found."""
+    return f"{check['key']}: asked {check['bound']}, found {_rounded(check['value'])}"
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_rounded(v) for v in value]
+    return float(f"{value:.4g}") if isinstance(value, float) else value
+
+
+def _printable(text: str) -> str:
+    """XML 1.0 has no control characters."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)

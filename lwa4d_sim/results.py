@@ -1,0 +1,122 @@
+"""One scenario run to its folder of results, written whole or not at all."""
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from lwa4d_sim.errors import RecordError, ScenarioError
+from lwa4d_sim.expect import evaluate
+from lwa4d_sim.mjcf import model_path
+from lwa4d_sim.record import RunLog
+from lwa4d_sim.runner import measure, run_all, versions
+from lwa4d_sim.scenario import Scenario
+
+
+def run_scenario(scenario: Scenario, out: Path | None = None, *, plots: bool = False) -> dict[str, Any]:
+    """Run all variants, check expectations and, with ``out``, write the folder ``out/NAME``.
+
+    Args:
+        scenario: what to run.
+        out: folder that the scenario's own folder goes into; None writes nothing.
+        plots: draw plots and the HTML report as well.
+
+    Returns:
+        The summary: ``{"name", "variants": {NAME: {"metrics", "expect": {"passed", "checks"}}}, "folder", ...}``.
+
+    Raises:
+        ScenarioError and other LwaErrors: bad input, nothing is written.
+        RecordError: the folder cannot be written.
+    """
+    folder = None if out is None else _claim(out, scenario.name)
+    logs = run_all(scenario)
+    summary = summarise(scenario, logs)
+    if folder is not None:
+        summary["folder"] = str(folder)
+        _write(folder, scenario, logs, summary, plots)
+    return summary
+
+
+def summarise(scenario: Scenario, logs: Mapping[str, RunLog]) -> dict[str, Any]:
+    """Metrics, expectations and provenance of a finished scenario."""
+    variants = {}
+    for name, values in measure(logs).items():
+        checks = evaluate(scenario.expect.get(name) or {}, values)
+        variants[name] = {
+            "metrics": values,
+            "expect": {"passed": all(check.passed for check in checks), "checks": [asdict(check) for check in checks]},
+            "seed": logs[name].seed,
+        }
+    arm = scenario.document["arm"]
+    return {
+        "name": scenario.name,
+        "variants": variants,
+        "folder": None,
+        "source": scenario.source,
+        "scenario": scenario.text,
+        "overrides": dict(scenario.overrides),
+        "versions": versions(),
+        "hashes": {
+            "scenario": _hash(scenario.text.encode()),
+            "document": _hash(json.dumps(scenario.document, sort_keys=True).encode()),
+            "model": _hash(model_path(arm, scenario.folder).read_bytes()),
+        },
+    }
+
+
+def passed(summary: Mapping[str, Any]) -> bool:
+    """Whether every expectation of every variant held."""
+    return all(variant["expect"]["passed"] for variant in summary["variants"].values())
+
+
+def _hash(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _claim(out: Path, name: str) -> Path:
+    """The scenario's folder, after making sure that it may be written, before any work is done.
+
+    Raises:
+        ScenarioError: ``out`` cannot be written, or the folder holds something that is not a run's result.
+    """
+    folder = out / name
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+        foreign = folder.exists() and not (folder / "summary.json").is_file() and any(folder.iterdir())
+    except OSError as error:
+        raise ScenarioError(f"{out}: cannot write results here: {error.strerror}; choose another folder with -o") from error
+    if foreign:
+        raise ScenarioError(f"{folder}: exists and is not a run's folder; choose another with -o, or move it away")
+    return folder
+
+
+def _write(folder: Path, scenario: Scenario, logs: Mapping[str, RunLog], summary: dict[str, Any], plots: bool) -> None:
+    """Write into a temporary folder beside ``folder`` and put it in place when all is there."""
+    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent))
+    try:
+        partial.chmod(0o755)
+        for name, log in logs.items():
+            log.save(partial / f"{name}.h5")
+        (partial / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+        if plots:
+            from lwa4d_sim.report import section_from_folder, write_report  # matplotlib costs half a second to import
+
+            write_report(partial / "report.html", [section_from_folder(partial)])
+        if folder.exists():
+            retired = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".old", dir=folder.parent))
+            os.replace(folder, retired / folder.name)
+            os.replace(partial, folder)
+            shutil.rmtree(retired)
+        else:
+            os.replace(partial, folder)
+    except OSError as error:
+        raise RecordError(f"{folder}: cannot write the results ({error})") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
