@@ -49,7 +49,7 @@ def read_samples(path: Path, joints: int) -> tuple[Array, Array]:
     if back.any():
         k = int(np.argmax(back)) + 1
         raise TrajectoryError(f"{place(k)}: t (={t[k]:g} s) must be later than in the sample before (={t[k - 1]:g} s)")
-    return t - t[0], table[:, 1:].reshape(len(t), derivatives, joints).swapaxes(0, 1)
+    return t, table[:, 1:].reshape(len(t), derivatives, joints).swapaxes(0, 1)
 
 
 def _headers(joints: int) -> list[list[str]]:

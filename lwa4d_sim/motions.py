@@ -168,7 +168,7 @@ class TaskMotion:
 
         The tool's motion is met exactly: dq = J^-1 dx and ddq = J^-1 (ddx - dJ dq). The self-motion of an arm with more
         joints than that (the part in the null space of J) comes from five-point differences of the inverse kinematics;
-        it is good to about 1e-9 of the joint speed and 1e-6 of the joint acceleration.
+        measured on a smooth path, it is good to 1e-9 of the joint speed and acceleration.
 
         Raises:
             KinematicsError: (as one of its subclasses) the arm cannot follow the path; the message says when.

@@ -57,6 +57,7 @@ class Plant:
         threads: int = 1,
     ) -> None:
         model = models if isinstance(models, mujoco.MjModel) else models[0]
+        _quiet()
         self._batch = Batch(model, len(q0), threads)
         if not isinstance(models, mujoco.MjModel):
             self._batch.set_models(models)
@@ -194,3 +195,11 @@ class _Window:
         if disturbance.duration is not None:
             last = -(-to_ns(disturbance.at + disturbance.duration) // timestep)
         return _Window(int(first), int(last), body, np.array([*disturbance.force, *disturbance.torque]))
+
+
+def _quiet() -> None:
+    """Keep MuJoCo's warnings out of the terminal and of a log file in the user's folder; `diverged` reports them."""
+    config = mujoco.MjLogConfig.get()
+    config.logto_console = False
+    config.logto_file = False
+    config.set()

@@ -25,7 +25,7 @@ def falling(k: ArrayLike, j: int) -> Array:
 def boundary_polynomial(T: ArrayLike, start: ArrayLike, end: ArrayLike) -> Array:
     """Polynomial of lowest degree with given derivatives at t = 0 and t = T.
 
-    The equations (thesis, eq. 4.23 ff.) are solved in s = t / T, where they do not depend on T.
+    The equations (thesis, eq. 4.24-4.26) are solved in s = t / T, where they do not depend on T.
 
     Args:
         T: length of the interval [s], positive; a number or an array that broadcasts to the trailing axes.

@@ -73,7 +73,8 @@ def joint(*points: tuple[float, ...]) -> Waypoints:
 def inside(motion: Trajectory, per_segment: int = 9) -> Array:
     """Times in every segment, clear of the knots."""
     start = np.concatenate([[0.0], motion.knots[:-1]])
-    return (start[:, None] + np.linspace(0.02, 0.98, per_segment) * (motion.knots - start)[:, None]).ravel()
+    times = start[:, None] + np.linspace(0.02, 0.98, per_segment) * (motion.knots - start)[:, None]
+    return np.asarray(times.ravel())
 
 
 def present(value: Array | None) -> Array:
