@@ -107,6 +107,7 @@ def load_model(
     timestep: float | None = None,
     integrator: str | None = None,
     base: Path | None = None,
+    tool_body: bool = False,
 ) -> mujoco.MjModel:
     """Compile a shipped arm or an MJCF file with ``edits`` applied.
 
@@ -118,6 +119,7 @@ def load_model(
         timestep: physics step [s]; default the file's.
         integrator: Euler, RK4, implicit, implicitfast or discrete; default the file's.
         base: folder that a relative path starts from.
+        tool_body: add a weightless body ``tool`` at the tool frame, for outside forces to act on.
 
     Raises:
         ModelError: the file is missing, broken, or not a serial arm with one plain motor a joint; an edit does not
@@ -129,6 +131,8 @@ def load_model(
         model = spec.compile()
         check_arm(model)
         _edit(spec, model, edits, name_or_path)
+        if tool_body:
+            _add_tool_body(spec, model)
         if timestep is not None:
             require(timestep > 0, f"timestep is {timestep} s; it must be positive")
             spec.option.timestep = timestep
@@ -141,6 +145,15 @@ def load_model(
     except ValueError as error:  # ModelError is one too; MuJoCo's own speaks in several lines
         raise ModelError(f"arm {name_or_path!r}: {' '.join(str(error).split())}") from error
     return model
+
+
+def _add_tool_body(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    site = tool_site(model)
+    if site >= 0:
+        frame = spec.site(model.site(site).name)
+        frame.parent.add_body(name="tool", pos=frame.pos, quat=frame.quat)
+    else:
+        spec.bodies[-1].add_body(name="tool")
 
 
 def torque_limits(model: mujoco.MjModel) -> Array:

@@ -192,7 +192,14 @@ def _timestep(settings: Settings) -> Ns:
 
 def _plant_model(settings: Settings, folder: Path) -> mujoco.MjModel:
     plant = settings.plant
-    return load_model(settings.arm, plant, timestep=plant.timestep, integrator=plant.integrator, base=folder)
+    return load_model(
+        settings.arm,
+        plant,
+        timestep=plant.timestep,
+        integrator=plant.integrator,
+        base=folder,
+        tool_body=any(disturbance.body is None for disturbance in plant.disturbances),
+    )
 
 
 def _start(settings: Settings, arm: _Arm) -> Array:

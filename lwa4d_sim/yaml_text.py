@@ -1,134 +1,178 @@
 """Reads YAML into plain data with a line number for every key, strictly: no dates, no yes/no, no NaN, no repeated keys."""
 
-import math
 import re
-from collections.abc import Mapping
 from typing import Any
 
 import yaml
 
+from lwa4d_sim.documents import DEPTH, NOT_FINITE, Path, dotted, finite, one_line, short
 from lwa4d_sim.errors import ScenarioError
 
-Path = tuple[str | int, ...]
 _LIMIT = 200_000  # nodes; a scenario has about a hundred, an alias bomb has more
+_TAG = "tag:yaml.org,2002:"
 
 
 class _Loader(yaml.CSafeLoader):
-    """PyYAML's safe loader with the numbers and booleans of YAML 1.2: 1e-3 is a number, `on` and `no` are text."""
+    """PyYAML's parser with the scalars of YAML 1.2: 1e-3 is a number; `on`, 1:30 and 2024-01-01 are text."""
 
-    yaml_implicit_resolvers = {  # noqa: RUF012  (PyYAML's own class attribute)
-        first: [(tag, regexp) for tag, regexp in rules if tag.rsplit(":", 1)[1] not in ("bool", "timestamp", "float")]
-        for first, rules in yaml.CSafeLoader.yaml_implicit_resolvers.items()
-    }
+    yaml_implicit_resolvers = {}  # noqa: RUF012  (PyYAML's own class attribute)
 
 
-_Loader.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), "tTfF")
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^(?:[-+]?(?:[0-9]+\.[0-9]*|\.[0-9]+|[0-9]+)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"),
-    list("-+0123456789."),
-)
+for _tag, _pattern, _first in (
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    ("int", r"[-+]?(?:0|[1-9][0-9]*)", list("-+0123456789")),
+    (
+        "float",
+        r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
+        list("-+0123456789."),
+    ),
+):
+    _Loader.add_implicit_resolver(_TAG + _tag, re.compile(f"^(?:{_pattern})$"), _first)
 
 
-def parse(text: str, source: str) -> tuple[Any, dict[Path, int]]:
+def parse(text: str, source: str, *, numbered: bool = True) -> tuple[Any, dict[Path, int]]:
     """Plain data (dict, list, str, int, float, bool, None) and the line of every path in it.
+
+    Args:
+        text: the YAML.
+        source: what errors call it.
+        numbered: errors give the line as well.
 
     Raises:
         ScenarioError: not YAML, or not the plain, finite, acyclic kind.
     """
+    reader = _Reader(source, numbered)
     try:
+        reader.check_depth(text)
         loader = _Loader(text)
         try:
             node = loader.get_single_node()
-            lines: dict[Path, int] = {}
-            _check(node, (), lines, source, [0], ())
-            return (None if node is None else loader.construct_document(node)), lines
         finally:
             loader.dispose()
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
-        where = f"{source}:{mark.line + 1}" if mark is not None else source
-        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise ScenarioError(f"{where}: not valid YAML: {problem}") from error
-    except (RecursionError, ValueError, OverflowError) as error:
-        if isinstance(error, ScenarioError):
-            raise
-        raise ScenarioError(f"{source}: not valid YAML: {error}") from error
+        parts = [getattr(error, "context", None), getattr(error, "problem", None) or str(error)]
+        where = source if mark is None else reader.where(mark)
+        raise ScenarioError(one_line(f"{where}: not valid YAML: {', '.join(part for part in parts if part)}")) from error
+    except UnicodeEncodeError as error:
+        raise ScenarioError(f"{source}: not valid YAML: holds a character that is no Unicode text") from error
+    return (None if node is None else reader.read(node, ())), reader.lines
 
 
-def _check(node: Any, path: Path, lines: dict[Path, int], source: str, count: list[int], above: tuple[Any, ...]) -> None:
-    """Record lines; refuse repeated and non-text keys, loops of aliases, NaN and infinity."""
-    if node is None:
-        return
-    line = node.start_mark.line + 1
-    lines.setdefault(path, line)
-    count[0] += 1
-    if count[0] > _LIMIT or node in above:
-        raise ScenarioError(f"{source}:{line}: aliases (*name) nest too deeply")
-    if isinstance(node, yaml.MappingNode):
-        seen: set[str] = set()
+class _Reader:
+    """Turns YAML nodes into plain data and notes their lines."""
+
+    def __init__(self, source: str, numbered: bool) -> None:
+        self._source, self._numbered = source, numbered
+        self._count = 0
+        self.lines: dict[Path, int] = {}
+
+    def where(self, mark: Any) -> str:
+        """The source and, if wanted, the line of a mark."""
+        return f"{self._source}:{mark.line + 1}" if self._numbered else self._source
+
+    def check_depth(self, text: str) -> None:
+        """Refuse deep nesting before the composer, which is recursive C code, meets it."""
+        depth = 0
+        for event in yaml.parse(text, _Loader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > DEPTH:
+                raise ScenarioError(f"{self.where(event.start_mark)}: nests deeper than {DEPTH} levels")
+
+    def read(self, node: Any, path: Path) -> Any:
+        """The data of a node at ``path``."""
+        self.lines.setdefault(path, node.start_mark.line + 1)
+        self._count += 1
+        if self._count > _LIMIT or len(path) > DEPTH:
+            raise ScenarioError(f"{self.where(node.start_mark)}: holds too much; do its aliases (*name) contain each other?")
+        if isinstance(node, yaml.MappingNode) and node.tag == _TAG + "map":
+            return self._mapping(node, path)
+        if isinstance(node, yaml.SequenceNode) and node.tag == _TAG + "seq":
+            return [self.read(item, (*path, i)) for i, item in enumerate(node.value)]
+        try:
+            return _SCALARS[node.tag.removeprefix(_TAG)](node.value)
+        except (KeyError, TypeError, ValueError) as error:
+            rule = str(error) if type(error) is ValueError else f"the tag {node.tag.replace(_TAG, '!!')} does not fit"
+            raise self._error(node, path, rule) from None
+
+    def _mapping(self, node: Any, path: Path) -> dict[str, Any]:
+        data: dict[str, Any] = {}
         for key, value in node.value:
-            where = f"{source}:{key.start_mark.line + 1}"
-            if key.tag != "tag:yaml.org,2002:str":
-                raise ScenarioError(f"{where}: key {key.value!r} must be plain text")
-            if key.value in seen:
-                raise ScenarioError(f"{where}: key '{key.value}' is given twice")
-            seen.add(key.value)
-            lines[(*path, key.value)] = key.start_mark.line + 1
-            _check(value, (*path, key.value), lines, source, count, (*above, node))
-    elif isinstance(node, yaml.SequenceNode):
-        for i, value in enumerate(node.value):
-            _check(value, (*path, i), lines, source, count, (*above, node))
-    elif node.tag == "tag:yaml.org,2002:float" and not _finite(node.value):
-        raise ScenarioError(f"{source}:{line}: {dotted(path)} (={node.value}): must be a finite number")
+            if not isinstance(key, yaml.ScalarNode) or key.tag != _TAG + "str":
+                shown = f" {key.value!r}" if isinstance(key, yaml.ScalarNode) else ""
+                raise ScenarioError(f"{self.where(key.start_mark)}: the key{shown} must be plain text")
+            if key.value in data:
+                raise ScenarioError(f"{self.where(key.start_mark)}: the key {key.value!r} is given twice")
+            self.lines[(*path, key.value)] = key.start_mark.line + 1
+            data[key.value] = self.read(value, (*path, key.value))
+        return data
+
+    def _error(self, node: Any, path: Path, rule: str) -> ScenarioError:
+        place = f"{self.where(node.start_mark)}: {dotted(path)}" if path else self.where(node.start_mark)
+        value = f" (={short(node.value)})" if isinstance(node, yaml.ScalarNode) else ""
+        return ScenarioError(one_line(f"{place}{value}: {rule}"))
 
 
-def _finite(text: str) -> bool:
+def _bool(text: str) -> bool:
+    if text.lower() not in ("true", "false"):
+        raise ValueError("must be true or false")
+    return text.lower() == "true"
+
+
+def _int(text: str) -> int:
+    if len(text) > 400:  # digits; far beyond any float, and Python refuses to read more than 4300
+        raise ValueError(NOT_FINITE)
+    return finite(int(text))
+
+
+def _float(text: str) -> float:
     try:
-        return math.isfinite(float(text.replace("_", "")))
-    except ValueError:
-        return False  # .nan and .inf are YAML's, not Python's
+        return finite(float(text))
+    except ValueError:  # .nan and .inf are words of YAML, not of Python
+        raise ValueError(NOT_FINITE) from None
 
 
-def dotted(path: Path) -> str:
-    """A path as people write it: controller.kp, points.2."""
-    return ".".join(str(part) for part in path)
+_SCALARS[node.tag.removeprefix(_TAG)](node.value)
+        except (KeyError, TypeError, ValueError) as error:
+            rule = str(error) if type(error) is ValueError else f"the tag {node.tag.replace(_TAG, '!!')} does not fit"
+            raise self._error(node, path, rule) from None
+
+    def _mapping(self, node: Any, path: Path) -> dict[str, Any]:
+        data: dict[str, Any] = {}
+        for key, value in node.value:
+            if not isinstance(key, yaml.ScalarNode) or key.tag != _TAG + "str":
+                shown = f" {key.value!r}" if isinstance(key, yaml.ScalarNode) else ""
+                raise ScenarioError(f"{self.where(key.start_mark)}: the key{shown} must be plain text")
+            if key.value in data:
+                raise ScenarioError(f"{self.where(key.start_mark)}: the key {key.value!r} is given twice")
+            self.lines[(*path, key.value)] = key.start_mark.line + 1
+            data[key.value] = self.read(value, (*path, key.value))
+        return data
+
+    def _error(self, node: Any, path: Path, rule: str) -> ScenarioError:
+        place = f"{self.where(node.start_mark)}: {dotted(path)}" if path else self.where(node.start_mark)
+        value = f" (={short(node.value)})" if isinstance(node, yaml.ScalarNode) else ""
+        return ScenarioError(one_line(f"{place}{value}: {rule}"))
 
 
-def merge(base: Any, override: Any) -> Any:
-    """``override`` laid over ``base``: mappings merge key by key, anything else replaces.
-
-    A mapping that names another `kind` than the base replaces it whole, for its keys are another block's.
-    """
-    if not (isinstance(base, Mapping) and isinstance(override, Mapping)):
-        return override
-    if "kind" in override and override["kind"] != base.get("kind", override["kind"]):
-        return override
-    merged = dict(base)
-    for key, value in override.items():
-        merged[key] = merge(base[key], value) if key in base else value
-    return merged
+def _bool(text: str) -> bool:
+    if text.lower() not in ("true", "false"):
+        raise ValueError("must be true or false")
+    return text.lower() == "true"
 
 
-def put(document: Any, path: str, value: Any) -> Any:
-    """A copy of ``document`` with ``value`` at the dotted ``path``; list positions are numbers.
-
-    Raises:
-        ScenarioError: the path leads through something that is neither a mapping nor a list.
-    """
-    return _put(document, path.split("."), value, path)
+def _int(text: str) -> int:
+    if len(text) > 400:  # of the same order as the largest float; Python refuses to read more than 4300
+        raise ValueError("has too many digits")
+    return int(text)
 
 
-def _put(node: Any, parts: list[str], value: Any, path: str) -> Any:
-    if not parts:
-        return merge(node, value)
-    head, rest = parts[0], parts[1:]
-    if isinstance(node, list):
-        if not head.isdigit() or int(head) >= len(node):
-            raise ScenarioError(f"{path}: '{head}' must be a position from 0 to {len(node) - 1}")
-        return [_put(item, rest, value, path) if i == int(head) else item for i, item in enumerate(node)]
-    if node is not None and not isinstance(node, Mapping):
-        raise ScenarioError(f"{path}: '{head}' cannot be set inside the value {node!r}")
-    copy = dict(node or {})
-    copy[head] = _put(copy.get(head), rest, value, path)
-    return copy
+def _float(text: str) -> float:
+    number = math.nan if text.endswith(("nan", "NaN", "NAN")) else float(re.sub(r"^([-+]?)\.(inf)$", r"\1\2", text.lower()))
+    if not math.isfinite(number):
+        raise ValueError("must be a finite number")
+    return number
+
+
+_SCALARS = {"str": str, "null": lambda text: None, "bool": _bool, "int": _int, "float": _float}

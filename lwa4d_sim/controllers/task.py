@@ -10,8 +10,8 @@ from lwa4d_sim.interfaces import Array, JointState, RigidBodyTerms, TaskReferenc
 from lwa4d_sim.rotations import rotation_vector
 
 # Below this smallest singular value of J (m for the rows of a 3-D task, mixed m and 1 for a 6-D one) the inverse is
-# damped; assumed: 5 cm is the lever arm below which the thesis's arm needs more speed than its drives have.
-SINGULAR_BELOW = 0.05
+# damped; assumed: half the smallest value on the shipped 7-DOF motion, so that only bad poses are touched.
+SINGULAR_BELOW = 0.03
 # Largest damping as a share of the mean eigenvalue of J M^-1 J^T (assumed: keeps the condition number below about 100).
 LARGEST_DAMPING = 0.01
 
