@@ -163,7 +163,7 @@ def _override(text: str) -> tuple[str, Any]:
     key, sign, value = text.partition("=")
     if not sign or not key.strip():
         raise ScenarioError(f"--set {text}: must be KEY=VALUE, e.g. controller.kp=2.0")
-    return key.strip(), parse(value, f"--set {text}")[0]
+    return key.strip(), parse(value, f"--set {key.strip()}", numbered=False)[0]
 
 
 def _combined(summaries: list[dict[str, Any]], out: Path) -> Path:

@@ -52,7 +52,8 @@ def _plain(value: Any, where: str, depth: int) -> Any:
             raise ScenarioError(f"{where}: {error}") from None
     if value is None or isinstance(value, str):
         return value
-    raise ScenarioError(f"{where} (={short(value)}): must be text, numbers, true, false, null, or lists or mappings of these")
+    kind = f"a {type(value).__name__}" if not isinstance(value, Mapping) else "a mapping with keys that are not text"
+    raise ScenarioError(f"{where}: {kind} cannot stand in a scenario; give text, numbers, lists or mappings")
 
 
 def dotted(path: Path) -> str:

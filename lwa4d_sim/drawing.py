@@ -15,10 +15,14 @@ from matplotlib.lines import Line2D
 from lwa4d_sim.errors import RecordError
 from lwa4d_sim.interfaces import NS_PER_S, Array, IntArray
 from lwa4d_sim.record import RunLog
+from lwa4d_sim.verdict import segment_word
 
 WIDTH = 8.0  # [in]; at 120 dpi 960 pixels, which a phone can show without losing the labels
-ROOM = 3.0  # an axis grows past the calm motion by at most this many times its range, so one wild run squashes nobody
+# An axis grows past the calm motion by at most so many times its range, that one wild run may not squash the others: a
+# vibration is worth showing whole, the way of a diverged run to infinity is not.
+ROOM_SHAKING, ROOM_DIVERGED = 10.0, 2.0
 BUCKETS = 900  # about the pixels of an axis
+_LINE = 12.0  # [pt] from one small line of text to the next
 MAX_NAMED = 8  # more segments than this are not named one by one
 
 # Okabe and Ito (2008), "Color Universal Design", less yellow and black: distinct for every kind of colour vision
@@ -78,6 +82,14 @@ class Ink:
         """Keyword arguments of a line."""
         return {"color": self.colour, "lw": self.width, "zorder": self.layer, "ls": self.dash}
 
+    @property
+    def onsets(self) -> dict[float, str]:
+        """What went wrong when [s]."""
+        told = {} if self.since is None else {self.since: f"{self.name}: shakes from {self.since:.2f} s"}
+        if self.diverged_at is not None:
+            told[self.diverged_at] = f"{self.name}: diverged at {self.diverged_at:.2f} s, run ends"
+        return told
+
 
 REFERENCE = Ink("reference", "_REF", BLACK, 1.1, 1.8, (0, (4, 2)))
 
@@ -132,12 +144,6 @@ def longest(logs: Iterable[RunLog]) -> RunLog:
     return max(logs, key=lambda log: len(log.q) * log.timestep)
 
 
-def segment_word(log: RunLog) -> str:
-    """What a stretch between two knots leads to, in the words of the scenario."""
-    kind = log.scenario.get("trajectory", {}).get("kind", "waypoints")
-    return "waypoint" if kind == "waypoints" else "segment"
-
-
 def canvas(title: str, log: RunLog, height: float) -> Figure:
     """An empty figure, ``height`` inches high, with its title and the scenario's name."""
     figure = Figure(figsize=(WIDTH, height))
@@ -149,22 +155,24 @@ def canvas(title: str, log: RunLog, height: float) -> Figure:
 
 
 def rows(
-    logs: Mapping[str, RunLog], title: str, labels: Sequence[str], columns: int = 1
+    logs: Mapping[str, RunLog], ink: Mapping[str, Ink], title: str, labels: Sequence[str], columns: int = 1
 ) -> tuple[Figure, list[list[Axes]]]:
-    """A figure of stacked panels over time, the segments marked in the first column; axes by row, then column."""
+    """A figure of stacked panels over time, segments and onsets marked; axes by row, then column."""
     first = next(iter(logs.values()))
-    height = 1.2 + 1.4 * len(labels)
+    onsets = [(t, text, i.colour) for i in ink.values() for t, text in i.onsets.items()]
+    head = 0.75 + _LINE / 72 * len(onsets)
+    height = head + 0.5 + 1.4 * len(labels)
     figure = canvas(title, first, height)
     grid = figure.add_gridspec(
         len(labels),
         columns,
         width_ratios=[1.7, 1][:columns],
         left=0.1,
-        right=0.985,
+        right=0.97,
         bottom=0.5 / height,
-        top=1 - 0.78 / height,
+        top=1 - head / height,
         hspace=0.14,
-        wspace=0.17,
+        wspace=0.2,
     )
     axes = [[figure.add_subplot(grid[row, column]) for column in range(columns)] for row in range(len(labels))]
     end = max(longest(logs.values()).t[-1], first.knots.max(initial=0), first.timestep / NS_PER_S)
@@ -172,11 +180,15 @@ def rows(
         row[0].set(ylabel=label, xlim=(0, end))
         for knot in first.knots[first.knots < end][: 4 * MAX_NAMED]:
             row[0].axvline(knot, color=GREY, lw=0.8, ls=":", zorder=1)
+        for t, _, colour in onsets:
+            row[0].axvline(t, color=colour, lw=1.2, ls="--", zorder=5)
         for ax in row:
             ax.tick_params(labelbottom=row is axes[-1])
     for ax in axes[-1]:
         ax.set_xlabel("time [s]")
     _name_segments(axes[0][0], first)
+    for k, (t, text, colour) in enumerate(onsets):
+        _name_onset(axes[0][0], t, text, colour, k)
     figure.align_ylabels([row[0] for row in axes])
     return figure, axes
 
@@ -186,7 +198,18 @@ def _name_segments(ax: Axes, log: RunLog) -> None:
         return
     for k, (start, end) in enumerate(zip([0.0, *log.knots[:-1]], log.knots, strict=True), start=1):
         where: Any = {"transform": ax.get_xaxis_transform(), "ha": "center", "va": "bottom"}
-        ax.text((start + end) / 2, 1.01, f"{segment_word(log)} {k}", color=GREY, fontsize=8.5, **where)
+        ax.text((start + end) / 2, 1.01, f"{segment_word(log.scenario)} {k}", color=GREY, fontsize=8.5, **where)
+
+
+def _name_onset(ax: Axes, t: float, text: str, colour: str, k: int) -> None:
+    """Text above the panel, in line ``k`` over the names of the segments, beside the onset's line drawn on up to it."""
+    height = _LINE * (k + 1)
+    stem: Any = {"arrowstyle": "-", "color": colour, "lw": 1.2, "ls": "--", "shrinkA": 0, "shrinkB": 0}
+    place: Any = {"xycoords": ax.get_xaxis_transform(), "textcoords": "offset points"}
+    ax.annotate("", (t, 1), (0, height + 8), arrowprops=stem, **place)
+    right = t > 0.5 * ax.get_xlim()[1]
+    side: Any = {"ha": "right" if right else "left", "va": "bottom", "fontsize": 8.5, "color": colour}
+    ax.annotate(text, (t, 1), (-4 if right else 4, height), **side, **place)
 
 
 def draw(axes: Sequence[Sequence[Axes]], curves: Sequence[Curve], unit: str) -> None:
@@ -195,49 +218,34 @@ def draw(axes: Sequence[Sequence[Axes]], curves: Sequence[Curve], unit: str) -> 
         for ink, t, y in curves:
             keep = envelope(y[:, j])
             ax.plot(t[keep], y[keep, j], marker="." if len(t) == 1 else "", **ink.line)
-        _limit(ax, [(ink.since, t, y[:, j]) for ink, t, y in curves], unit)
-    marked = {ink.name: ink for ink, _, _ in curves if ink.since is not None}
-    for k, ink in enumerate(marked.values()):
-        _mark(axes, ink, k)
+        _limit(ax, [(ink, t, y[:, j]) for ink, t, y in curves], unit)
 
 
-def _limit(ax: Axes, signals: Sequence[tuple[float | None, Array, Array]], unit: str) -> None:
-    """Fit the axis to the calm motion and say in it how far the rest goes."""
-    finite = [(since, t[np.isfinite(y)], y[np.isfinite(y)]) for since, t, y in signals]
-    everything = np.concatenate([y for _, _, y in finite])
-    if not everything.size:
+def _limit(ax: Axes, signals: Sequence[tuple[Ink, Array, Array]], unit: str) -> None:
+    """Fit the axis to the calm motion and some of the rest, and say in it how far that goes."""
+    finite = [(ink, t[np.isfinite(y)], y[np.isfinite(y)]) for ink, t, y in signals if np.isfinite(y).any()]
+    if not finite:
         return
-    calm = np.concatenate([y if since is None else y[t < since] for since, t, y in finite])
-    calm = calm if calm.size else everything
-    room = ROOM * np.ptp(calm)
-    least, most = everything.min(), everything.max()
-    bottom, top = max(least, calm.min() - room), min(most, calm.max() + room)
+    calm = np.concatenate([y if ink.since is None else y[t < ink.since] for ink, t, y in finite])
+    calm = calm if calm.size else np.concatenate([y for _, _, y in finite])
+    bottom, top, least, most = calm.min(), calm.max(), calm.min(), calm.max()
+    for ink, _, y in finite:
+        room = np.ptp(calm) * (ROOM_SHAKING if ink.diverged_at is None else ROOM_DIVERGED)
+        bottom, top = min(bottom, max(y.min(), calm.min() - room)), max(top, min(y.max(), calm.max() + room))
+        least, most = min(least, y.min()), max(most, y.max())
     margin = max(0.07 * (top - bottom), 1e-6)  # the floor keeps a constant signal from an axis of no height
     ax.set_ylim(bottom - margin, top + margin)
     if most > top:
-        boxed(ax, 0.006, 0.95, f"▲ up to {most:.3g} {unit}", va="top", transform=ax.transAxes)
+        _boxed(ax, 0.95, "top", f"▲ up to {most:.3g} {unit}")
     if least < bottom:
-        boxed(ax, 0.006, 0.05, f"▼ down to {least:.3g} {unit}", va="bottom", transform=ax.transAxes)
+        _boxed(ax, 0.05, "bottom", f"▼ down to {least:.3g} {unit}")
 
 
-def _mark(axes: Sequence[Sequence[Axes]], ink: Ink, k: int) -> None:
-    """A line at the onset of instability and at the end of a diverged run, told in the top panel."""
-    told = {} if ink.since is None else {ink.since: f"{ink.name}: shakes from {ink.since:.2f} s"}
-    if ink.diverged_at is not None:
-        told[ink.diverged_at] = f"{ink.name}: diverged at {ink.diverged_at:.2f} s, run ends"
-    top = axes[0][0]
-    for j, (t, text) in enumerate(told.items()):
-        for ax, *_ in axes:
-            ax.axvline(t, color=ink.colour, lw=1.2, ls="--", zorder=5)
-        side = "left" if t < 0.5 * top.get_xlim()[1] else "right"
-        where = {"transform": top.get_xaxis_transform(), "ha": side, "va": "top"}
-        boxed(top, t, 0.95 - 0.17 * (k + j), f" {text} ", color=ink.colour, **where)
-
-
-def boxed(ax: Axes, x: float, y: float, text: str, **style: Any) -> None:
-    """Small text that stays readable on top of lines."""
+def _boxed(ax: Axes, height: float, side: str, text: str) -> None:
+    """Small text at the left edge of a panel that stays readable on top of lines."""
     box = {"facecolor": "white", "alpha": 0.8, "pad": 0.8, "linewidth": 0}
-    ax.text(x, y, text, bbox=box, **{"fontsize": 8.5, "color": GREY, "zorder": 6, **style})
+    place: Any = {"transform": ax.transAxes, "va": side}
+    ax.text(0.006, height, text, bbox=box, fontsize=8.5, color=GREY, zorder=6, **place)
 
 
 def legend(figure: Figure, entries: Iterable[tuple[str, Ink]]) -> None:

@@ -78,7 +78,7 @@ class Drives:
     def _watchdog(self, tau: Array, arrived: Arrived, now: Ns, steps: int) -> Array:
         instants = now + self._dt * np.arange(steps, dtype=np.int64)
         overdue = instants[None, :, None] - arrived.since[:, None, :] - self._timeout
-        late = overdue >= 0
+        late = (overdue >= 0) & ~np.isnan(tau)  # no command yet is not a late one: the brakes stay closed
         if self._late.policy == "zero":
             return np.where(late, 0.0, tau)
         if self._late.policy == "ramp":

@@ -61,7 +61,8 @@ class NominalModel:
     @property
     def M(self) -> Array:
         """Inertia matrix (N, n, n) [kg m^2], rotor inertia included."""
-        return self._field("M")[:, self._dense]
+        # take, not an index: its layout, and with it every product's last bit, is the same for any N
+        return self._field("M").take(self._dense, axis=1)
 
     @property
     def h(self) -> Array:

@@ -6,7 +6,7 @@ Every kind is a pair. The *source* lives in the drive, sees every plant step and
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 
@@ -50,40 +50,30 @@ class FilterSource:
     def __init__(self, q0: Array, time_constant: float, timestep: float) -> None:
         self._T = time_constant
         self._dt = timestep
-        self._y = np.stack([q0, q0])
-        self._last = np.stack([q0, np.zeros_like(q0)])
+        # rows: y1, y2, q and dq before the stretch, then q and dq at each of its steps
+        self._rows = np.stack([q0, q0, q0, np.zeros_like(q0)], axis=1)
 
     def observe(self, q: Array, dq: Array) -> None:
-        weights = _filter_weights(q.shape[1], self._dt, self._T)
-        self._y = (
-            weights.state[0] * self._y
-            + weights.state[1] * self._y[0]
-            + weights.first[0] * self._last[0]
-            + weights.first[1] * self._last[1]
-            + (weights.q * q).sum(axis=2)
-            + (weights.dq * dq).sum(axis=2)
-        )
-        self._last = np.stack([q[:, -1], dq[:, -1]])
+        steps = q.shape[1]
+        if self._rows.shape[1] != 4 + 2 * steps:
+            blank = np.empty((len(q), 2 * steps, q.shape[2]))
+            self._rows = np.concatenate([self._rows[:, :4], blank], axis=1)
+        rows = self._rows
+        rows[:, 4 : 4 + steps], rows[:, 4 + steps :] = q, dq
+        rows[:, :2] = np.matmul(_filter_weights(steps, self._dt, self._T), rows)
+        rows[:, 2], rows[:, 3] = q[:, -1], dq[:, -1]
 
     def read(self) -> Array:
-        speed: Array = (self._y[0] - self._y[1]) / self._T
+        speed: Array = (self._rows[:, 0] - self._rows[:, 1]) / self._T
         return speed
 
 
-class _Weights(NamedTuple):
-    """The filter over some plant steps as one linear map; leading axis 2 for (y1, y2)."""
-
-    state: Array  # (2, 2, 1, 1): on (y1, y2) itself, then on y1
-    first: Array  # (2, 2, 1, 1): of the sample before the first step, q then dq
-    q: Array  # (2, 1, steps, 1)
-    dq: Array  # (2, 1, steps, 1)
-
-
 @lru_cache(maxsize=64)
-def _filter_weights(steps: int, dt: float, T: float) -> _Weights:
-    """Convolutions of the cubic Hermite basis with the impulse responses e^(-s/T)/T and s e^(-s/T)/T^2.
+def _filter_weights(steps: int, dt: float, T: float) -> Array:
+    """The filter over ``steps`` plant steps as one linear map (2, 4 + 2 steps), from `FilterSource`'s rows to (y1, y2).
 
-    By Gauss-Legendre quadrature: 32 nodes a step are exact to rounding up to dt = 10 T.
+    Convolutions of the cubic Hermite basis with the impulse responses e^(-s/T)/T and s e^(-s/T)/T^2, by Gauss-Legendre
+    quadrature: 32 nodes a step are exact to rounding up to dt = 10 T.
     """
     nodes, gauss = np.polynomial.legendre.leggauss(32)
     u, gauss = 0.5 * (nodes + 1.0), 0.5 * dt * gauss
@@ -95,13 +85,8 @@ def _filter_weights(steps: int, dt: float, T: float) -> _Weights:
         for basis, (signal, at) in zip(hermite, [(0, j), (1, j), (0, j + 1), (1, j + 1)], strict=True):
             samples[:, signal, at] += impulses @ basis
     decay = np.exp(-steps * dt / T)
-    state = np.array([[decay, decay], [0.0, steps * dt / T * decay]])
-    return _Weights(
-        state[:, :, None, None],
-        np.swapaxes(samples[:, :, 0], 0, 1)[:, :, None, None],
-        samples[:, 0, None, 1:, None],
-        samples[:, 1, None, 1:, None],
-    )
+    state = np.array([[decay, 0.0], [steps * dt / T * decay, decay]])
+    return np.hstack([state, samples[:, :, 0], samples[:, 0, 1:], samples[:, 1, 1:]])
 
 
 class PassThrough:

@@ -74,8 +74,8 @@ class TaskReference:
 class Measurement:
     """What the drives latched: ``q`` (N, n) [rad] and, when a drive estimates it, ``dq`` (N, n) [rad/s].
 
-    ``stamp`` (N, n) [ns] is the instant each joint was sampled; joints may differ in age. A joint that has never been
-    heard of has stamp -1.
+    ``stamp`` [ns], (N, n) or (1, 1), is the instant each joint was sampled; joints may differ in age. A joint that has
+    never been heard of has stamp -1.
     """
 
     stamp: IntArray
@@ -88,8 +88,8 @@ class Arrived:
     """The newest data at an instant, joint by joint.
 
     Attributes:
-        stamp: when each joint's datum was made [ns], (N, n); -1 where none has arrived.
-        since: when it arrived [ns], (N, n).
+        stamp: when each joint's datum was made [ns], (N, n) or, when all are alike, (1, 1); -1 where none has arrived.
+        since: when it arrived [ns], shaped likewise.
         values: the data, each (N, n).
     """
 
@@ -117,6 +117,10 @@ class Trajectory(Protocol):
 
     def task(self, t: Array) -> TaskReference:
         """Tool motion at the times ``t`` (K,) [s]; each field has leading axis K."""
+        ...
+
+    def tool_point(self, t: Array) -> Array:
+        """Tool point alone (K, 3) [m] at the times ``t`` (K,) [s]; the cheap part of `task`."""
         ...
 
 

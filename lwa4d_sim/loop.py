@@ -170,19 +170,25 @@ class ControllerSide:
         self._controller, self._model = controller, model
         self._ready = False
 
-    def tick(self, arrived: Arrived, now: Ns, k: int) -> tuple[JointState, Array]:
-        """Estimate, compute; torque is NaN for an arm with a joint that was never heard of."""
+    def tick(self, arrived: Arrived, now: Ns, k: int, start: tuple[Array, ...]) -> tuple[JointState, Array]:
+        """Estimate, compute.
+
+        A joint that was never heard of is taken to be where it was at the ``start``, so that nothing jumps when it
+        speaks; until every joint of an arm has spoken, that arm's state and torque are NaN outside.
+        """
         values = arrived.values
         heard = None
         if not self._ready:
-            heard = (arrived.stamp >= 0).all(axis=1)
+            known = arrived.stamp >= 0
+            heard = known.all(axis=1, keepdims=True)
             self._ready = bool(heard.all())
-            values = tuple(np.where(heard[:, None], value, 0.0) for value in values)
+            values = tuple(np.where(known, value, first) for value, first in zip(values, start, strict=True))
         meas = Measurement(arrived.stamp, values[0], values[1] if len(values) > 1 else None)
         state = self._estimator.update(meas, now)
         tau = self._controller.torque(state, self._references.at(k), self._model)
         if heard is not None and not self._ready:
-            tau = np.where(heard[:, None], tau, np.nan)
+            state = JointState(np.where(heard, state.q, np.nan), np.where(heard, state.dq, np.nan))
+            tau = np.where(heard, tau, np.nan)
         return state, tau
 
 
@@ -198,6 +204,7 @@ def simulate(arm: ArmSide, control: ControllerSide, link: Link, timing: Timing, 
     """
     before = timing.phase // timestep
     after = timing.period // timestep - before
+    start = arm.latch()
     for k in range(timing.ticks):
         now = Ns(k * timing.period)
         link.up.send(now, arm.latch())
@@ -208,7 +215,7 @@ def simulate(arm: ArmSide, control: ControllerSide, link: Link, timing: Timing, 
         state = command = age = None
         arrived = link.up.newest(now)
         if arrived is not None:
-            state, command = control.tick(arrived, now, k)
+            state, command = control.tick(arrived, now, k, start)
             age = now - arrived.stamp
             link.down.send(now, (command,))
         q, dq, tau = arm.advance(link.down, now, after)

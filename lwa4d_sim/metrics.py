@@ -68,11 +68,11 @@ def metrics(log: "RunLog") -> dict[str, Any]:
         "max_joint_error": _per_joint(np.abs(joint_error), np.max),
         "rms_joint_error": _per_joint(joint_error**2, np.mean, np.sqrt),
         "velocity_error_rms": _per_joint((ticks.dq - ticks.dq_true) ** 2, np.mean, np.sqrt),
-        "peak_torque": _per_joint(np.abs(log.tau), np.max),
+        "peak_torque": _peaks(log.tau),
         "torque_ripple": _per_joint(tail, np.ptp),
-        "peak_speed": _per_joint(np.abs(log.dq), np.max),
+        "peak_speed": _peaks(log.dq),
         "vibration": vibration,
-        "saturation_fraction": float(np.mean(np.abs(log.tau) >= log.tau_max)),
+        "saturation_fraction": float(np.mean((log.tau >= log.tau_max) | (log.tau <= -log.tau_max))),
         "data_age_max": float(ticks.age.max()) if ticks.age.size else None,
     }
     return values
@@ -176,6 +176,12 @@ def _smoothing_kernel(half: int) -> Array:
 
 def _rms(values: Array) -> float:
     return math.sqrt(float(np.mean(values**2)))
+
+
+def _peaks(values: Array) -> list[float]:
+    """Largest magnitude of each column, without a copy of the whole record."""
+    peaks: list[float] = np.maximum(values.max(axis=0), -values.min(axis=0)).tolist()
+    return peaks
 
 
 def _per_joint(values: Array, reduce: Any, then: Any = None) -> list[float] | None:

@@ -1,6 +1,6 @@
 """Reads an MJCF arm, checks that it is one, and applies a scenario's physical changes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -128,11 +128,12 @@ def load_model(
     path = model_path(name_or_path, base)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
-        model = spec.compile()
-        check_arm(model)
-        _edit(spec, model, edits, name_or_path)
-        if tool_body:
-            _add_tool_body(spec, model)
+        if tool_body or any(getattr(edits, f.name) != f.default for f in fields(ArmEdits)):
+            plain = spec.compile()
+            check_arm(plain)
+            _edit(spec, plain, edits, name_or_path)
+            if tool_body:
+                _add_tool_body(spec, plain)
         if timestep is not None:
             require(timestep > 0, f"timestep is {timestep} s; it must be positive")
             spec.option.timestep = timestep
@@ -141,6 +142,7 @@ def load_model(
             spec.option.integrator = _INTEGRATORS[integrator]
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         model = spec.compile()
+        check_arm(model)
         check_damping(model, home(model))
     except ValueError as error:  # ModelError is one too; MuJoCo's own speaks in several lines
         raise ModelError(f"arm {name_or_path!r}: {' '.join(str(error).split())}") from error

@@ -29,6 +29,10 @@ FIRST, SECOND = np.array([1, -8, 0, 8, -1]) / 12, np.array([-1, 16, -30, 16, -1]
 class Kinematics(Protocol):
     """What a motion needs to know of the arm; shapes as in `lwa4d_sim.kinematics`."""
 
+    def point(self, q: Array) -> Array:
+        """Tool point (..., 3) [m] at ``q`` (..., n)."""
+        ...
+
     def fk(self, q: Array) -> Pose:
         """Tool pose at ``q`` (..., n)."""
         ...
@@ -85,6 +89,10 @@ class JointMotion:
     def joint(self, t: Array) -> JointReference:
         """The motion itself at the times ``t`` (K,) [s]."""
         return JointReference(*_resting(self.curve, t, self.duration))
+
+    def tool_point(self, t: Array) -> Array:
+        """Where the tool point is at the times ``t`` (K,) [s], (K, 3)."""
+        return self.kinematics.point(self.joint(t).q)
 
     def task(self, t: Array) -> TaskReference:
         """What the tool does at the times ``t`` (K,) [s]: dx = J dq, ddx = J ddq + dJ dq; the posture is the motion."""
@@ -151,6 +159,10 @@ class TaskMotion:
     def duration(self) -> float:
         """Length of the motion [s]."""
         return float(self.knots[-1])
+
+    def tool_point(self, t: Array) -> Array:
+        """Where the tool point is at the times ``t`` (K,) [s], (K, 3)."""
+        return _resting(self.point, t, self.duration)[0]
 
     def task(self, t: Array) -> TaskReference:
         """The motion itself at the times ``t`` (K,) [s]."""

@@ -1,5 +1,6 @@
 """The arm itself: N MuJoCo simulations stepped together under held torques, brakes and outside forces."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -72,6 +73,7 @@ class Plant:
         self._next_check = 0
         self._none = np.zeros(len(q0), bool)
         self.running = np.ones(len(q0), bool)
+        self._all_running = True
         self.q[:] = q0
         self.dq[:] = 0.0
 
@@ -105,13 +107,13 @@ class Plant:
         if self._step < self._next_check:
             return self._none
         self._next_check = self._step + CHECK_EVERY
-        with np.errstate(invalid="ignore"):
-            lost = self.running & (
-                (self._warnings.sum(axis=1) > 0) | ~(np.abs(self.dq).max(axis=1) < SPEED_LIMIT)
-            )
-        if lost.any():
-            self.running &= ~lost
-            self.q[lost], self.dq[lost] = 0.0, 0.0
+        speed = np.abs(self.dq)
+        if speed.max() < SPEED_LIMIT and not self._warnings.any():  # False for NaN
+            return self._none
+        lost = self.running & ((self._warnings.sum(axis=1) > 0) | ~(speed.max(axis=1) < SPEED_LIMIT))
+        self.running &= ~lost
+        self._all_running = bool(self.running.all())
+        self.q[lost], self.dq[lost] = 0.0, 0.0
         return lost
 
     def _span(self, tau: Array | None, steps: int) -> tuple[Array, Array]:
@@ -121,7 +123,7 @@ class Plant:
             self._brake(np.flatnonzero(self.running), 0, q, dq)
             return q, dq
         # a sum is the cheapest look for a NaN among few numbers
-        if np.isnan(tau.sum()) or not self.running.all():
+        if not self._all_running or math.isnan(tau.sum()):
             self._mixed(np.broadcast_to(tau, (len(tau), steps, tau.shape[2])), q, dq)
         elif tau.shape[1] == 1:
             self._ctrl[:] = tau[:, 0]

@@ -26,11 +26,11 @@ from lwa4d_sim.drawing import (
     longest,
     rows,
     save,
-    segment_word,
 )
 from lwa4d_sim.errors import RecordError
 from lwa4d_sim.interfaces import NS_PER_S, Array
 from lwa4d_sim.record import RunLog
+from lwa4d_sim.verdict import segment_word
 
 ZOOM = 0.3  # [s] a few swings of a loop with a period of 10 ms
 JUMP_SPEED = 10.0  # [m/s] a reference faster than this jumps and is drawn with a gap (assumed: far above any arm)
@@ -95,7 +95,7 @@ def _entries(symbol: str, ink: Iterable[Ink]) -> list[tuple[str, Ink]]:
 
 def _tool(logs: _Logs, ink: _Inks) -> _Made:
     title = "End-effector position"
-    figure, axes = rows(logs, title, ["x [m]", "y [m]", "z [m]"])
+    figure, axes = rows(logs, ink, title, ["x [m]", "y [m]", "z [m]"])
     log = longest(logs.values())
     reference = Curve(REFERENCE, log.t, log.x_ref)
     draw(axes, [reference, *(Curve(ink[name], log.t, log.x) for name, log in logs.items())], "m")
@@ -111,7 +111,7 @@ def _tool(logs: _Logs, ink: _Inks) -> _Made:
 def _torques(logs: _Logs, ink: _Inks) -> _Made:
     title = "Applied torque"
     log = next(iter(logs.values()))
-    figure, axes = rows(logs, title, _joints("τ", log, "N m"))
+    figure, axes = rows(logs, ink, title, _joints("τ", log, "N m"))
     draw(axes, [Curve(ink[name], log.t, log.tau) for name, log in logs.items()], "N m")
     # a list, not a generator: every panel has to be marked
     reached = any([_limit_marks(ax, logs, ink, j) for j, (ax,) in enumerate(axes)])  # noqa: C419
@@ -155,7 +155,7 @@ def _joint_error(logs: _Logs, ink: _Inks) -> _Made:
     if not any(len(curve.t) for curve in curves):
         return
     title = "Joint error"
-    figure, axes = rows(logs, title, _joints("e", next(iter(logs.values())), "rad"))
+    figure, axes = rows(logs, ink, title, _joints("e", next(iter(logs.values())), "rad"))
     draw(axes, curves, "rad")
     legend(figure, _entries("e", ink.values()))
     caption = (
@@ -169,9 +169,9 @@ def _velocity(logs: _Logs, ink: _Inks) -> _Made:
     sampled = {name: log for name, log in logs.items() if log.period > log.timestep and len(log.ticks.t)}
     for name, log in sampled.items():
         title = "Joint speed: estimate and truth" + (f" ({name})" if len(sampled) > 1 else "")
-        figure, axes = rows({name: log}, title, _joints("dq", log, "rad/s"), columns=2)
-        truth = replace(ink[name], colour=BLACK, width=0.9, layer=3)
-        guess = replace(ink[name], width=1.3, layer=2)
+        figure, axes = rows({name: log}, {name: ink[name]}, title, _joints("dq", log, "rad/s"), columns=2)
+        truth = replace(ink[name], colour=BLACK, width=1.4, layer=2)
+        guess = replace(ink[name], width=1.0, layer=3)
         ticks = log.ticks
         draw(axes, [Curve(truth, log.t, log.dq), Curve(guess, ticks.t, ticks.dq)], "rad/s")
         start = _violent(log)
@@ -210,7 +210,9 @@ def _path(logs: _Logs, ink: _Inks) -> _Made:
     figure = canvas(title, log, 6.0)
     ax: Any = figure.add_axes((0.0, 0.02, 1.0, 0.88), projection="3d", computed_zorder=False)
     reference = log.x_ref
-    jumps = np.linalg.norm(np.diff(reference, axis=0), axis=1) > JUMP_SPEED * log.timestep / NS_PER_S
+    steps = np.linalg.norm(np.diff(reference, axis=0), axis=1)
+    jumps = steps > JUMP_SPEED * log.timestep / NS_PER_S
+    moves = bool((steps[~jumps] > 0).any())
     ax.plot(*_thin(np.insert(reference, np.flatnonzero(jumps) + 1, np.nan, axis=0)).T, **REFERENCE.line)
     for name, run in logs.items():
         ax.plot(*_thin(run.x).T, marker="." if len(run.q) == 1 else "", **ink[name].line)
@@ -223,11 +225,16 @@ def _path(logs: _Logs, ink: _Inks) -> _Made:
         ax.scatter(*goal, marker="o", s=42, facecolor="white", edgecolor=BLACK, zorder=7)
         ax.text(*goal, f"   {k}", weight="bold", zorder=8)
     _to_scale(ax, np.concatenate([reference, *(run.x for run in logs.values())]))
-    legend(figure, _entries("X", [REFERENCE, *ink.values()]))
-    marks = f" The circles are the goals ({segment_word(log)} 1, 2, ...)." if named else ""
+    legend(figure, _entries("X", [*([REFERENCE] if moves else []), *ink.values()]))
+    desired = (
+        "The dashed line is the desired path."
+        if moves
+        else "The reference jumps from goal to goal, so there is no desired path: the arm finds its own."
+    )
+    marks = f" The circles are the goals ({segment_word(log.scenario)} 1, 2, ...)." if named else ""
     caption = (
-        f"The way of the tool through space, to scale, from the square on.{marks} The dashed line is the desired path; "
-        "where the reference jumps from goal to goal there is none, and the arm finds its own way."
+        f"The way of the tool through space, to scale, from the square on.{marks} {desired} Fuzz or loops in a line "
+        "are vibration that reaches the tool."
     )
     yield "path", title, caption, figure
 
@@ -244,8 +251,10 @@ def _to_scale(ax: Any, points: Array) -> None:
     half = 0.525 * np.maximum(high - low, max(0.1 * float((high - low).max()), 1e-3))
     for axis, centre, reach in zip("xyz", (low + high) / 2, half, strict=True):
         ax.set(**{f"{axis}lim": (centre - reach, centre + reach), f"{axis}label": f"{axis} [m]"})
-    ax.set_box_aspect(half)
+    ax.set_box_aspect(half, zoom=1.08)
     ax.locator_params(nbins=5)
+    for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+        axis.labelpad = 9
 
 
 def _age(logs: _Logs, ink: _Inks) -> _Made:
@@ -253,7 +262,7 @@ def _age(logs: _Logs, ink: _Inks) -> _Made:
     if not any(len(np.unique(age)) > 1 for age in ages.values()):
         return
     title = "Age of the measured data"
-    figure, axes = rows(logs, title, ["age [ms]"])
+    figure, axes = rows(logs, ink, title, ["age [ms]"])
     draw(axes, [Curve(ink[name], log.ticks.t, 1e3 * log.ticks.age[:, None]) for name, log in logs.items()], "ms")
     legend(figure, _entries("age", ink.values()))
     caption = (

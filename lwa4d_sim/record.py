@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -182,10 +182,18 @@ class ComputedPaths:
     trajectory: Trajectory
 
     def x(self, q: Array) -> Array:
-        return self.kinematics.point(q)
+        return _in_blocks(self.kinematics.point, q)
 
     def x_ref(self, t: Array) -> Array:
-        return self.trajectory.task(t).x
+        return _in_blocks(self.trajectory.tool_point, t)
+
+
+def _in_blocks(function: Callable[[Array], Array], samples: Array, size: int = 2000) -> Array:
+    """``function`` of many samples, a block at a time, so that its scratch arrays stay small."""
+    out = np.empty((len(samples), 3))
+    for start in range(0, len(samples), size):
+        out[start : start + size] = function(samples[start : start + size])
+    return out
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,7 +51,8 @@ class _Seen:
         if tick.state is None or tick.command is None or tick.age is None:
             return
         self.q[:, k], self.dq[:, k], self.tau[:, k] = tick.state.q, tick.state.dq, tick.command
-        self.age[:, k] = tick.age.max(axis=1) / NS_PER_S
+        heard = ~np.isnan(tick.state.q[:, 0])
+        self.age[:, k] = np.where(heard, tick.age.max(axis=1) / NS_PER_S, np.nan)
 
     def log(self, i: int, q: Array, dq: Array, t: Array, trajectory: Trajectory, *, exact: bool) -> TickLog:
         """Of simulation ``i``, with the arm's own q and dq at the ticks; ``exact`` says the controller saw just those."""

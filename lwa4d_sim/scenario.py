@@ -1,20 +1,24 @@
 """A scenario file: its text, its variants, and where in it every key stands."""
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from lwa4d_sim.documents import Path as KeyPath
+from lwa4d_sim.documents import dotted, merge, one_line, plain, put, short
 from lwa4d_sim.errors import LwaError, ScenarioError
 from lwa4d_sim.expect import check_expectations
-from lwa4d_sim.schema import Misfit, fit
+from lwa4d_sim.schema import Misfit, fit, unknown_key
 from lwa4d_sim.settings import Settings
-from lwa4d_sim.yaml_text import Path as KeyPath
-from lwa4d_sim.yaml_text import dotted, merge, parse, put
+from lwa4d_sim.yaml_text import parse
 
 DEFAULT_VARIANT = "default"  # the one variant of a scenario that names none
-_TOP_KEYS = ("name", "arm", "initial", "plant", "trajectory", "controller", "loop", "variants", "expect")
+_VARIANT_KEYS = ("arm", "initial", "plant", "trajectory", "controller", "loop")
+_TOP_KEYS = ("name", *_VARIANT_KEYS, "variants", "expect")
+_LARGEST = 10_000_000  # [bytes]; no scenario is that long, but a device file is
+_NAME_BYTES = 200  # file systems take 255, and a temporary name is a little longer than the name
+_NAME_RULE = f'must be text that can name a file: printable, at most {_NAME_BYTES} bytes, without / \\ : * ? " < > |'
 
 
 @dataclass(frozen=True)
@@ -55,12 +59,14 @@ class Scenario:
             ScenarioError: the file cannot be read or is not a scenario; says file, line, key, value and rule.
         """
         path = Path(path)
+        source = one_line(str(path))
         try:
-            text = path.read_text(encoding="utf-8")
+            with path.open("rb") as file:
+                text = file.read(_LARGEST).decode("utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "not a text file (UTF-8)"
-            raise ScenarioError(f"{path}: cannot read the scenario: {reason}") from error
-        return Scenario.parse(text, source=str(path), folder=path.parent, overrides=overrides)
+            reason = error.strerror if isinstance(error, OSError) else "it is not a text file (UTF-8)"
+            raise ScenarioError(f"{source}: cannot read the scenario: {reason}") from error
+        return Scenario.parse(text, source=source, folder=path.parent, overrides=overrides)
 
     @staticmethod
     def parse(
@@ -73,9 +79,13 @@ class Scenario:
         """A scenario from its text; see `load`."""
         document, lines = parse(text, source)
         if not isinstance(document, Mapping):
-            raise ScenarioError(f"{source}: a scenario is a mapping with the keys {', '.join(_TOP_KEYS)}")
-        for key, value in (overrides or {}).items():
-            document = put(document, key, value)
+            raise ScenarioError(f"{source}: must be a mapping with the keys {', '.join(_TOP_KEYS)}")
+        overrides = {key: plain(value, one_line(f"{source}: {key}")) for key, value in (overrides or {}).items()}
+        for key, value in overrides.items():
+            try:
+                document = put(document, key, value)
+            except ScenarioError as error:
+                raise ScenarioError(one_line(f"{source}: {error}")) from None
         made = Scenario(
             name=str(document.get("name", "")),
             source=source,
@@ -85,7 +95,7 @@ class Scenario:
             expect={},
             document=document,
             _lines=lines,
-            overrides=dict(overrides or {}),
+            overrides=overrides,
         )
         made._check_top()
         variants = {name: made._settings(name) for name in made._variant_names()}
@@ -94,18 +104,12 @@ class Scenario:
 
     def error(self, path: KeyPath, rule: str, variant: str | None = None) -> ScenarioError:
         """An error at a key: file, line, key, value, rule."""
-        key = dotted(path)
-        value = self._value(path, variant)
-        shown = "" if value is None or isinstance(value, Mapping) else f" (={_short(value)})"
-        where = self._where(path, variant)
-        note = f" in variant '{variant}'" if variant not in (None, DEFAULT_VARIANT) else ""
-        return ScenarioError(f"{where}: {key}{shown}{note}: {rule}" if key else f"{where}: {rule}")
+        return ScenarioError(f"{self._place(path, variant)}: {rule}")
 
     def locate(self, error: LwaError, key: str, variant: str | None) -> LwaError:
         """``error`` with the place in this file that it is about, its class kept."""
-        at = getattr(error, "key", None) or key
-        where = self._where(tuple(at.split(".")), variant)
-        return type(error)(f"{where}: {at}: {error}")
+        path = tuple((getattr(error, "key", None) or key).split("."))
+        return type(error)(f"{self._place(path, variant, mapping='')}: {one_line(str(error))}")
 
     def _variant_names(self) -> list[str]:
         variants = self.document.get("variants")
@@ -114,25 +118,21 @@ class Scenario:
     def _check_top(self) -> None:
         for key in self.document:
             if key not in _TOP_KEYS:
-                close = difflib.get_close_matches(key, _TOP_KEYS, n=1)
-                hint = f"did you mean '{close[0]}'? " if close else ""
-                raise self.error((key,), f"unknown key; {hint}valid here: {', '.join(_TOP_KEYS)}")
-        name = self.document.get("name")
-        if not isinstance(name, str) or not name.strip() or any(c in name for c in '/\\\0:*?"<>|') or name[0] == ".":
-            raise self.error(("name",), "must be text that can name a folder")
+                raise self.error((key,), unknown_key(key, _TOP_KEYS))
+        if not _can_name_a_file(self.document.get("name")):
+            raise self.error(("name",), _NAME_RULE)
         for key in ("variants", "expect"):
             value = self.document.get(key)
             if value is not None and not isinstance(value, Mapping):
                 raise self.error((key,), "must be a mapping of variant names")
         for variant, changes in (self.document.get("variants") or {}).items():
-            if any(c in variant for c in '/\\\0:*?"<>|') or not variant or variant[0] == ".":
-                raise self.error(("variants", variant), "a variant's name must be able to name a file")
+            if not _can_name_a_file(variant):
+                raise self.error(("variants", variant), f"a variant's name {_NAME_RULE}")
             if changes is not None and not isinstance(changes, Mapping):
                 raise self.error(("variants", variant), "must be a mapping of overrides, or {}")
             for key in changes or {}:
-                if key in ("name", "variants", "expect") or key not in _TOP_KEYS:
-                    allowed = ", ".join(k for k in _TOP_KEYS if k not in ("name", "variants", "expect"))
-                    raise self.error(("variants", variant, key), f"a variant can override {allowed}")
+                if key not in _VARIANT_KEYS:
+                    raise self.error(("variants", variant, key), unknown_key(key, _VARIANT_KEYS))
 
     def _settings(self, variant: str) -> Settings:
         try:
@@ -160,29 +160,50 @@ class Scenario:
                     raise self.error(("expect", variant, key), problem)
         return dict(expect)
 
-    def _value(self, path: KeyPath, variant: str | None) -> Any:
-        value: Any = self.document if variant is None else self.resolved(variant)
+    def _place(self, path: KeyPath, variant: str | None, *, mapping: str = "a mapping") -> str:
+        """File, line, key and value of a setting of a variant, or (without a variant) of the document."""
+        origin = self._origin(path, variant)
+        line = next(
+            (self._lines[origin[:cut]] for cut in range(len(origin), 0, -1) if origin[:cut] in self._lines), None
+        )
+        names = [dotted(origin[:cut]) for cut in range(1, len(origin) + 1)]
+        overridden = any(name in self.overrides for name in names)
+        where = self.source if overridden or line is None else f"{self.source}:{line}"
+        notes: list[str] = []
+        if origin[-len(path) :] == path:
+            value = self._at(origin)
+            notes = [mapping if isinstance(value, Mapping) else f"={short(value)}", "overridden" if overridden else ""]
+        of = f" of variant '{variant}'" if variant not in (None, DEFAULT_VARIANT) else ""
+        noted = f" ({', '.join(filter(None, notes))})" if any(notes) else ""
+        return one_line(f"{where}: {dotted(path)}{of}{noted}")
+
+    def _origin(self, path: KeyPath, variant: str | None) -> KeyPath:
+        """Where in the document the setting at ``path`` stands, or as much of it as is there; a variant's own first."""
+        for cut in range(len(path), 0, -1):
+            for origin in ([("variants", variant, *path[:cut])] if variant else []) + [path[:cut]]:
+                if self._at(origin) is not _ABSENT:
+                    return origin
+        return ()
+
+    def _at(self, path: KeyPath) -> Any:
+        value: Any = self.document
         for part in path:
             try:
                 value = value[part]
             except (KeyError, IndexError, TypeError):
-                return None
+                return _ABSENT
         return value
 
-    def _where(self, path: KeyPath, variant: str | None) -> str:
-        """File and line of a key, or of the nearest key above it; overrides have no line."""
-        key = dotted(path)
-        if any(key == o or key.startswith(o + ".") for o in self.overrides):
-            return f"{self.source} with {key} overridden"
-        full = [("variants", variant, *path[:cut]) for cut in range(len(path), 0, -1)] if variant else []
-        plain = [path[:cut] for cut in range(len(path), 0, -1)]
-        # the longest match wins; a variant's own line before the base's of the same length
-        for candidate in sorted([*full, *plain], key=lambda p: -(len(p) - 2 * (p[:1] == ("variants",)))):
-            if candidate in self._lines:
-                return f"{self.source}:{self._lines[candidate]}"
-        return self.source
+
+_ABSENT = object()
 
 
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+def _can_name_a_file(name: Any) -> bool:
+    return (
+        isinstance(name, str)
+        and 0 < len(name.encode("utf-8", "replace")) <= _NAME_BYTES
+        and name.isprintable()
+        and name == name.strip()
+        and name[0] != "."
+        and not set(name) & set('/\\:*?"<>|')
+    )

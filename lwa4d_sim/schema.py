@@ -1,20 +1,21 @@
-"""Fits plain data to the parameter classes and says, for what does not fit, which key is wrong and what would be right."""
+"""Fits plain data to the parameter classes; of what does not fit it says which key is wrong and what would be right."""
 
 import dataclasses
 import difflib
 import json
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
+from annotated_types import Ge, Gt, Lt, MinLen
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from lwa4d_sim.controllers import CustomController
+from lwa4d_sim.documents import Path
 from lwa4d_sim.settings import CHOICES, Settings
-from lwa4d_sim.yaml_text import Path
 
 
 class Misfit(Exception):
@@ -36,12 +37,12 @@ def fit(document: Any) -> Settings:
     Raises:
         Misfit: with the first thing wrong, from the top down.
     """
-    chosen: dict[Path, str] = {}
-    resolved = _resolve(Settings, document, (), chosen)
+    reading = _Reading()
+    resolved = reading.resolve([Settings], document, ())
     try:
         return _adapter().validate_json(json.dumps(resolved), strict=True)
     except ValidationError as error:
-        raise _explain(error.errors(include_url=False, include_context=False), resolved, chosen) from None
+        raise reading.explain(error.errors(include_url=False, include_context=False), resolved) from None
 
 
 def json_schema() -> dict[str, Any]:
@@ -57,104 +58,160 @@ def _adapter() -> TypeAdapter[Settings]:
 @cache
 def _fields(cls: Any) -> dict[str, Any]:
     """Field names and resolved types of a parameter class."""
-    hints = typing.get_type_hints(cls)
+    hints = typing.get_type_hints(cls, include_extras=True)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
-def _resolve(annotation: Any, node: Any, path: Path, chosen: dict[Path, str]) -> Any:
-    """``node`` with left-out kinds filled in; notes which class each mapping belongs to."""
-    alternatives = _alternatives(annotation)
-    if isinstance(node, Mapping):
-        classes = [a for a in alternatives if dataclasses.is_dataclass(a)]
-        return _resolve_mapping(classes, dict(node), path, chosen) if classes else node
-    if isinstance(node, list):
-        for item in (typing.get_args(a)[0] for a in alternatives if typing.get_origin(a) is tuple):
-            return [_resolve(item, value, (*path, i), chosen) for i, value in enumerate(node)]
-    elif all(dataclasses.is_dataclass(a) for a in alternatives):
-        raise Misfit(path, "must be a mapping of keys to values")
-    return node
-
-
-def _alternatives(annotation: Any) -> list[Any]:
-    """The members of a union, unions inside unions and Annotated wrappers opened."""
+def _members(annotation: Any, rules: tuple[Any, ...] = ()) -> list[Any]:
+    """The types a value may have, unions opened; a type with rules stays wrapped in Annotated."""
     if typing.get_origin(annotation) is typing.Annotated:
-        return _alternatives(typing.get_args(annotation)[0])
+        inner, *more = typing.get_args(annotation)
+        return _members(inner, (*rules, *more))
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
-        return [inner for member in typing.get_args(annotation) for inner in _alternatives(member)]
-    return [annotation]
+        return [member for part in typing.get_args(annotation) for member in _members(part, rules)]
+    return [typing.Annotated[annotation, *rules] if rules else annotation]
 
 
-def _resolve_mapping(classes: list[Any], node: dict[str, Any], path: Path, chosen: dict[Path, str]) -> Any:
-    cls = _choose(classes, node, path)
-    fields = _fields(cls)
-    if cls is CustomController:
-        extra = {key: node.pop(key) for key in list(node) if key not in fields or key == "options"}
-        node["options"] = extra
-    for key in node:
-        if key not in fields:
-            close = difflib.get_close_matches(key, fields, n=1)
-            hint = f"did you mean '{close[0]}'? " if close else ""
-            raise Misfit((*path, key), f"unknown key; {hint}valid here: {', '.join(fields)}")
-    for field in dataclasses.fields(cls):
-        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-        if required and field.name not in node:
-            raise Misfit((*path, field.name), "is missing")
-    chosen[path] = cls.__name__
-    return {key: _resolve(fields[key], value, (*path, key), chosen) for key, value in node.items()}
+def _bare(member: Any) -> Any:
+    return typing.get_args(member)[0] if typing.get_origin(member) is typing.Annotated else member
+
+
+def _items(members: Sequence[Any], i: int) -> list[Any]:
+    """What the item ``i`` of a list may be."""
+    tuples = [typing.get_args(_bare(m)) for m in members if typing.get_origin(_bare(m)) is tuple]
+    return [inner for args in tuples for inner in _members(args[0 if args[-1] is Ellipsis else min(i, len(args) - 1)])]
+
+
+class _Reading:
+    """What each place of one document may hold, and which class each of its mappings means."""
+
+    def __init__(self) -> None:
+        self._valid: dict[Path, list[Any]] = {}
+        self._chosen: dict[Path, str] = {}
+
+    def resolve(self, members: list[Any], node: Any, path: Path) -> Any:
+        """``node`` with left-out kinds filled in."""
+        self._valid[path] = members
+        if isinstance(node, Mapping):
+            classes = [member for member in members if dataclasses.is_dataclass(member)]
+            return self._resolve_mapping(classes, dict(node), path) if classes else node
+        if isinstance(node, list):
+            return [self.resolve(_items(members, i), value, (*path, i)) for i, value in enumerate(node)]
+        return node
+
+    def _resolve_mapping(self, classes: list[Any], node: dict[str, Any], path: Path) -> Any:
+        cls = _choose(classes, node, path)
+        fields = _fields(cls)
+        if cls is CustomController:
+            node["options"] = {key: node.pop(key) for key in list(node) if key not in fields or key == "options"}
+        for key in node:
+            if key not in fields:
+                raise Misfit((*path, key), unknown_key(key, fields))
+        for field in dataclasses.fields(cls):
+            required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+            if required and field.name not in node:
+                raise Misfit((*path, field.name), f"is missing; it must be {_wanted(_members(fields[field.name]))}")
+        self._chosen[path] = cls.__name__
+        return {key: self.resolve(_members(fields[key]), value, (*path, key)) for key, value in node.items()}
+
+    def explain(self, errors: list[ErrorDetails], document: Any) -> Misfit:
+        """The first error that belongs to the classes the document chose."""
+        found = [(path, error) for error in errors if (path := self._path(error["loc"], document)) is not None]
+        first = found[0][0] if found else ()
+        # of a union's branches the one that got furthest into the value knows best what is wrong
+        path, error = max(
+            (pair for pair in found if pair[0][: len(first)] == first),
+            key=lambda pair: len(pair[0]),
+            default=((), errors[0]),
+        )
+        if error["type"] == "value_error":
+            return Misfit(path, error["msg"].removeprefix("Value error, "))
+        return Misfit(path, f"must be {_wanted(self._valid[path])}")
+
+    def _path(self, location: tuple[int | str, ...], document: Any) -> Path | None:
+        """The document's path in pydantic's, or None when that runs through a class the document did not choose."""
+        path: Path = ()
+        node = document
+        for part in location:
+            inside = isinstance(node, Mapping) and part in node
+            inside = inside or (isinstance(node, list) and isinstance(part, int) and part < len(node))
+            if inside:
+                node = node[part]
+                path = (*path, part)
+            elif path in self._chosen and part != self._chosen[path]:
+                return None
+        return path
+
+
+def unknown_key(key: str, valid: Mapping[str, Any] | Sequence[str]) -> str:
+    """The rule that an unknown key breaks."""
+    close = difflib.get_close_matches(key, valid, n=1)
+    hint = f"did you mean '{close[0]}'? " if close else ""
+    return f"unknown key; {hint}valid here: {', '.join(valid)}"
 
 
 def _choose(classes: list[Any], node: dict[str, Any], path: Path) -> Any:
     """The class a mapping means: by its kind, else by its keys."""
-    kinds = {kind: cls for cls in classes if "kind" in _fields(cls) for kind in typing.get_args(_fields(cls)["kind"])}
+    plain = [cls for cls in classes if "kind" not in _fields(cls)]
     if "kind" not in node and len(path) == 1 and path[0] in CHOICES:
         node["kind"] = CHOICES[str(path[0])]
-    if kinds and ("kind" in node or len(kinds) == len(classes)):
-        kind = node.get("kind")
-        if len(kinds) == 1 and len(classes) == 1 and kind is None:
-            return classes[0]
-        if isinstance(kind, str) and kind in kinds:
-            return kinds[kind]
-        choices = list(kinds)
-        if CustomController in classes:
-            if isinstance(kind, str) and ":" in kind:
-                return CustomController
-            choices.append("package.module:Class")
-        raise Misfit((*path, "kind"), f"must be one of {', '.join(choices)}" if "kind" in node else _missing(choices))
-    plain = [cls for cls in classes if "kind" not in _fields(cls)]
-    if not plain:
-        raise Misfit((*path, "kind"), _missing(list(kinds)))
-    return max(plain, key=lambda cls: len(_fields(cls).keys() & node.keys()))
+    if plain and not ("kind" in node and len(plain) < len(classes)):
+        return max(plain, key=lambda cls: len(_fields(cls).keys() & node.keys()))
+    kinds = _kinds(classes)
+    if "kind" not in node:
+        raise Misfit((*path, "kind"), f"is missing; give one of {', '.join(kinds)}")
+    kind = node["kind"]
+    if not isinstance(kind, str) or (kind not in kinds and not (_OWN in kinds and ":" in kind)):
+        raise Misfit((*path, "kind"), f"must be one of {', '.join(kinds)}")
+    return kinds.get(kind, CustomController)
 
 
-def _missing(choices: list[str]) -> str:
-    return f"is missing; one of {', '.join(choices)}"
+_OWN = "package.module:Class"  # stands for the kind of a user's own class
 
 
-def _explain(errors: list[ErrorDetails], document: Any, chosen: dict[Path, str]) -> Misfit:
-    """The first error that belongs to the classes the document chose, with all rules for its key."""
-    rules: dict[Path, list[str]] = {}
-    for error in errors:
-        path = _document_path(error["loc"], document, chosen)
-        if path is not None:
-            rule = error["msg"].removeprefix("Input ").removeprefix("Value error, ")
-            rules.setdefault(path, []).append(rule)
-    if not rules:  # every branch was another class's: name the shallowest
-        first = errors[0]
-        return Misfit(tuple(p for p in first["loc"][:1]), first["msg"])
-    path, found = next(iter(rules.items()))
-    return Misfit(path, " or ".join(dict.fromkeys(found)))
+def _kinds(classes: Sequence[Any]) -> dict[str, Any]:
+    """The classes by the kinds that choose them."""
+    with_kind = [cls for cls in classes if "kind" in _fields(cls)]
+    return {kind: cls for cls in with_kind for kind in typing.get_args(_fields(cls)["kind"]) or [_OWN]}
 
 
-def _document_path(location: tuple[int | str, ...], document: Any, chosen: dict[Path, str]) -> Path | None:
-    """The document's path in pydantic's location, or None when it runs through a class the document did not choose."""
-    path: Path = ()
-    node = document
-    for part in location:
-        inside = isinstance(node, Mapping) and part in node
-        inside = inside or (isinstance(node, list) and isinstance(part, int) and part < len(node))
-        if inside:
-            node = node[part]
-            path = (*path, part)
-        elif path in chosen and part != chosen[path]:
-            return None
-    return path
+def _wanted(members: Sequence[Any]) -> str:
+    """What would be valid, in words."""
+    classes: list[Any] = [member for member in members if dataclasses.is_dataclass(member)]
+    phrases = [_phrase(member) for member in members if member is not types.NoneType and member not in classes]
+    if kinds := _kinds(classes):
+        phrases.append(f"a mapping of kind {' or '.join(kinds)}")
+    phrases += [f"a mapping (keys: {', '.join(_fields(cls))})" for cls in classes if "kind" not in _fields(cls)]
+    return ", or ".join(dict.fromkeys(phrases))
+
+
+def _phrase(member: Any, plural: bool = False) -> str:
+    bare, rules = _bare(member), typing.get_args(member)[1:] if _bare(member) is not member else ()
+    if bare in _NOUNS:
+        bounds = " and ".join(filter(None, map(_bound, rules)))
+        return f"{_NOUNS[bare][plural]} {bounds}".strip()
+    if typing.get_origin(bare) is typing.Literal:
+        values = typing.get_args(bare)
+        return f"one of {', '.join(values)}" if len(values) > 1 else repr(values[0])
+    if typing.get_origin(bare) is tuple:
+        args = typing.get_args(bare)
+        items = " or ".join(_phrase(item, plural=True) for item in _members(args[0]))
+        if args[-1] is not Ellipsis:
+            return f"{'lists' if plural else 'a list'} of {len(args)} {items}"
+        some = "one or more " if any(isinstance(rule, MinLen) for rule in rules) else ""
+        return f"{'lists' if plural else 'a list'} of {some}{items}"
+    return "mappings" if plural else "a mapping"
+
+
+_NOUNS: Mapping[Any, tuple[str, str]] = {
+    bool: ("true or false", "true or false"),
+    float: ("a number", "numbers"),
+    int: ("a whole number", "whole numbers"),
+    str: ("text", "texts"),
+}
+
+
+def _bound(rule: Any) -> str:
+    """A limit in words, or nothing for a rule that is none."""
+    words = {Gt: "above", Ge: "of at least", Lt: "below"}
+    return f"{words[type(rule)]} {getattr(rule, type(rule).__name__.lower())}" if type(rule) in words else ""

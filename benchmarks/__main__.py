@@ -1,0 +1,156 @@
+"""The speed and memory table of docs/benchmarks.md: ratios within one run, medians of interleaved repeats.
+
+Run with `make bench`, or `python -m benchmarks [NAME...]`.
+"""
+
+import subprocess
+import sys
+import tempfile
+import time
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+from mujoco.batch import Batch
+
+from lwa4d_sim.batch import default_workers
+from lwa4d_sim.cli import shipped_scenarios
+from lwa4d_sim.mjcf import load_model
+from lwa4d_sim.runner import run, run_batch
+from lwa4d_sim.scenario import Scenario
+
+# 20 s, 7 joints, physics 1 ms, control 10 ms, RK4 on both sides
+OVERRIDES = {"trajectory.segment_time": 5.0}
+STEPS = 20_000
+
+
+def scenario() -> Scenario:
+    return Scenario.load(shipped_scenarios() / "ct7_joint.yaml", OVERRIDES)
+
+
+def torques() -> np.ndarray:
+    """The torques of the sampled run, to be replayed without a controller: (STEPS, 7)."""
+    return run(scenario(), "can").tau[:STEPS]
+
+
+def raw(model: mujoco.MjModel, control: np.ndarray) -> Callable[[], None]:
+    """The C loop: `mujoco.rollout` on one thread."""
+    data = mujoco.MjData(model)
+    state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+    full = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    data.qpos[:] = start()
+    mujoco.mj_getState(model, data, state, full)
+    runner = rollout.Rollout(nthread=0)
+    return lambda: void(runner.rollout(model, [data], state[None], control[None]))
+
+
+def void(_: object) -> None:
+    """Throw a result away."""
+
+
+def start() -> np.ndarray:
+    return np.asarray(scenario().variants["can"].initial.q)
+
+
+def ratio(subject: Callable[[], None], against: Callable[[], None], repeats: int) -> tuple[float, float]:
+    """Median time of ``subject`` over the median time of ``against``, interleaved, and the latter [s]."""
+    times: tuple[list[float], list[float]] = ([], [])
+    for function in (subject, against):
+        function()
+    for _ in range(repeats):
+        for function, into in zip((subject, against), times, strict=True):
+            begin = time.perf_counter()
+            function()
+            into.append(time.perf_counter() - begin)
+    return median(times[0]) / median(times[1]), median(times[1])
+
+
+def sampled() -> tuple[float, float]:
+    model, one = load_model("lwa4d_7dof", timestep=0.001, integrator="RK4"), scenario()
+    return ratio(lambda: void(run(one, "can")), raw(model, torques()), 7)
+
+
+def ideal() -> tuple[float, float]:
+    model, one = load_model("lwa4d_7dof", timestep=0.001, integrator="RK4"), scenario()
+    return ratio(lambda: void(run(one, "ideal")), raw(model, torques()), 5)
+
+
+def batch_1024() -> tuple[float, float]:
+    """1,024 runs of 2 s each, metrics included, against the threaded C loop of the same steps.
+
+    Shorter than 20 s so that it ends within a minute; the cost per step does not depend on the length.
+    """
+    n, steps, threads = 1024, 2_000, default_workers()
+    one = Scenario.load(shipped_scenarios() / "ct7_joint.yaml", {"trajectory.segment_time": 0.5})
+    members = [{"plant.seed": seed} for seed in range(n)]
+
+    def ours() -> None:
+        for log in run_batch(one, members, "can", threads=threads):
+            log.metrics()
+
+    model = load_model("lwa4d_7dof", timestep=0.001, integrator="RK4")
+    control = np.broadcast_to(run(one, "can").tau[:steps], (n, steps, 7))
+    batch = Batch(model, n, threads)
+    qpos, qvel = batch.bind("qpos"), batch.bind("qvel")
+
+    def limit() -> None:
+        qpos[:], qvel[:] = start(), 0.0
+        batch.rollout(steps, control, record=("qpos",))
+
+    return ratio(ours, limit, 3)
+
+
+def command() -> tuple[float, float]:
+    """`lwa4d-sim run --no-plots` of one 20 s scenario against the imports plus the raw stepping."""
+    text = scenario().text.split("variants:")[0].replace("segment_time: 3.0", "segment_time: 5.0")
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "one.yaml"
+        file.write_text(text)
+        ours = [sys.executable, "-m", "lwa4d_sim", "run", str(file), "--no-plots", "-o", folder]
+        imports = [sys.executable, "-c", "import mujoco, numpy, h5py, yaml"]
+        step = raw(load_model("lwa4d_7dof", timestep=0.001, integrator="RK4"), torques())
+
+        def floor() -> None:
+            subprocess.run(imports, check=True)
+            step()
+
+        return ratio(lambda: void(subprocess.run(ours, check=True, capture_output=True)), floor, 7)
+
+
+def memory() -> tuple[float, float]:
+    """Peak bytes per joint and plant step of a 20 s run with its metrics, worst of ideal and can."""
+    worst = 0.0
+    for variant in ("ideal", "can"):
+        one = scenario()
+        tracemalloc.start()
+        run(one, variant).metrics()
+        worst = max(worst, tracemalloc.get_traced_memory()[1] / (STEPS * 7))
+        tracemalloc.stop()
+    return worst, 1.0
+
+
+BENCHMARKS: dict[str, tuple[Callable[[], tuple[float, float]], str, float]] = {
+    "sampled": (sampled, "one 20 s sampled run / raw C loop", 1.5),
+    "ideal": (ideal, "one 20 s ideal run / raw C loop", 5.0),
+    "batch": (batch_1024, "1,024 sampled runs in one batch / raw threaded loop", 1.25),
+    "command": (command, "lwa4d-sim run --no-plots / imports and raw loop", 2.5),
+    "memory": (memory, "peak bytes per joint and plant step", 40.0),
+}
+
+
+def main() -> None:
+    names = sys.argv[1:] or list(BENCHMARKS)
+    print(f"MuJoCo {mujoco.__version__}, {default_workers()} processors\n")
+    print(f"| {'what':52} | {'limit':>6} | {'found':>6} | {'base [s]':>8} |\n|{'-' * 54}|{'-' * 8}|{'-' * 8}|{'-' * 10}|")
+    for name in names:
+        function, what, limit = BENCHMARKS[name]
+        found, base = function()
+        print(f"| {what:52} | {limit:6.2f} | {found:6.2f} | {base:8.3f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
