@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -285,5 +286,5 @@ def load_arm(name_or_path: str) -> Arm:
     from lwa4d_sim.kinematics import kinematics_for
     from lwa4d_sim.mjcf import chain_of, load_model
 
-    model = load_model(name_or_path)
+    model = copy(load_model(name_or_path))  # the caller's own, to change as he likes
     return Arm(model, kinematics_for(chain_of(model)), Dynamics(model))

@@ -1,15 +1,18 @@
-"""Many scenarios on many processes: outcomes in the order asked, a JUnit file, and one bad file never stops the rest."""
+"""Many scenarios on many processes: outcomes in the order asked, a JUnit file; one bad file never stops the rest."""
 
 import multiprocessing
 import os
+import signal
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from lwa4d_sim.documents import one_line
 from lwa4d_sim.errors import LwaError, RecordError, ScenarioError
 from lwa4d_sim.results import passed, run_scenario
 from lwa4d_sim.scenario import Scenario
@@ -53,37 +56,92 @@ def find_scenarios(places: Sequence[Path]) -> list[Path]:
 
 
 def run_files(files: Sequence[Path], out: Path | None, *, plots: bool, workers: int) -> Iterator[Job]:
-    """Run scenario files on ``workers`` processes; yields outcomes in the order of ``files``."""
+    """Run scenario files on ``workers`` processes; yields outcomes in the order of ``files``.
+
+    Raises:
+        ScenarioError: two of them would write the same folder.
+    """
+    if out is not None:
+        _check_names(files)
     if workers <= 1 or len(files) <= 1:
         yield from (_run_file(file, out, plots) for file in files)
         return
-    # spawned, because a forked copy of a process with running threads may hang
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(files)), mp_context=context) as pool:
-        futures: list[Future[Job]] = [pool.submit(_run_file, file, out, plots) for file in files]
+    with _pool(min(workers, len(files))) as pool:
+        futures = [pool.submit(_run_file, file, out, plots) for file in files]
         try:
             for file, future in zip(files, futures, strict=True):
                 try:
                     yield future.result()
-                except Exception as error:  # a killed worker, or out of memory: the file's outcome, not the batch's end
-                    yield Job(file, 0.0, None, f"{file}: the worker died ({error or type(error).__name__})")
-        except GeneratorExit:
+                except BrokenExecutor:  # some worker was killed, and took the pool with it: the file gets its own
+                    yield _run_alone(file, out, plots)
+        except BaseException:  # interrupted, or nobody wants the rest
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def _pool(workers: int) -> ProcessPoolExecutor:
+    """Worker processes that leave Ctrl-C to this one, so that what they write is whole.
+
+    Spawned, because a forked copy of a process with running threads may hang.
+    """
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(workers, context, signal.signal, (signal.SIGINT, signal.SIG_IGN))
+
+
+def _run_alone(file: Path, out: Path | None, plots: bool) -> Job:
+    with _pool(1) as pool:
+        try:
+            return pool.submit(_run_file, file, out, plots).result()
+        except BrokenExecutor:
+            return Job(file, 0.0, None, f"{file}: the process that ran it was killed; is there enough memory?")
 
 
 def _run_file(file: Path, out: Path | None, plots: bool) -> Job:
     start = time.perf_counter()
     try:
         summary = run_scenario(Scenario.load(file), out, plots=plots)
-    except LwaError as error:
-        return Job(file, time.perf_counter() - start, None, str(error))
+    except Exception as error:  # a user's own controller may raise anything; the others still run
+        kind = "" if isinstance(error, LwaError) else f"{file}: {type(error).__name__}: "
+        return Job(file, time.perf_counter() - start, None, one_line(f"{kind}{error}"))
     return Job(file, time.perf_counter() - start, summary)
+
+
+def _check_names(files: Sequence[Path]) -> None:
+    seen: dict[str, Path] = {}
+    for file in files:
+        try:
+            name = Scenario.load(file).name
+        except LwaError:
+            continue  # told when its turn comes
+        if name in seen:
+            raise ScenarioError(f"{seen[name]} and {file} are both named '{name}' and would share one folder")
+        seen[name] = file
 
 
 def default_workers() -> int:
     """Processors this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def check_writable(path: Path) -> None:
+    """Make sure that a file can be written, before hours of work.
+
+    Raises:
+        RecordError: it cannot.
+    """
+    partial = _partial(path)
+    if path.is_dir():
+        raise RecordError(f"{path}: cannot write this file (it is a folder)")
+    try:
+        partial.touch()
+        partial.unlink()
+    except OSError as error:
+        raise RecordError(f"{path}: cannot write this file ({error.strerror})") from error
+
+
+def _partial(path: Path) -> Path:
+    """What a file is called until it is whole."""
+    return path.with_name(f"{path.name}.part")
 
 
 def write_junit(path: Path, jobs: Sequence[Job]) -> None:
@@ -112,12 +170,13 @@ def write_junit(path: Path, jobs: Sequence[Job]) -> None:
             broken = [describe(check) for check in variant["expect"]["checks"] if not check["passed"]]
             if broken:
                 ElementTree.SubElement(case, "failure", message=_printable("; ".join(broken)))
-    partial = path.with_name(path.name + ".part")
+    partial = _partial(path)
     try:
         ElementTree.ElementTree(root).write(partial, encoding="utf-8", xml_declaration=True)
         os.replace(partial, path)
     except OSError as error:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):
+            partial.unlink()
         raise RecordError(f"{path}: cannot write the JUnit file ({error.strerror})") from error
 
 

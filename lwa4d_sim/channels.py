@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from annotated_types import Ge, Lt, MinLen
 
+from lwa4d_sim.errors import ScenarioError
 from lwa4d_sim.interfaces import NS_PER_S, Annotated, Array, Arrived, Channel, IntArray, NonNegative, Ns, to_ns
 
 _STRICT: Any = {"extra": "forbid", "allow_inf_nan": False}
@@ -133,7 +134,7 @@ class DirectChannel:
 
     def __init__(self, latency: Ns, gate: "Gate") -> None:
         self._latency, self._gate = latency, gate
-        self._queue: deque[tuple[int, Ns, tuple[Array, ...]]] = deque()
+        self._queue: deque[tuple[Ns, Ns, tuple[Array, ...]]] = deque()
         self._newest: Arrived | None = None
 
     def send(self, stamp: Ns, values: tuple[Array, ...]) -> None:
@@ -149,7 +150,7 @@ class DirectChannel:
         return self._newest
 
     def changes(self, after: Ns, before: Ns) -> list[Ns]:
-        return [Ns(arrival) for arrival, _, _ in self._queue if after < arrival < before]
+        return sorted({arrival for arrival, _, _ in self._queue if after < arrival < before})
 
 
 class RandomChannel:
@@ -302,7 +303,15 @@ class Transport:
         return base + self.jitter
 
     def build(self, seeds: Sequence[int], signal: int, n: int, gate: Gate) -> Channel:
-        """The channel of N simulations; ``signal`` tells this channel's random streams from all others."""
+        """The channel of N simulations; ``signal`` tells this channel's random streams from all others.
+
+        Raises:
+            ScenarioError: a list of latencies is not one per joint.
+        """
+        if isinstance(self.latency, tuple) and len(self.latency) != n:
+            raise ScenarioError(
+                f"has {len(self.latency)} values; give one number or one for each of {n} joints", key="loop.latency"
+            )
         if isinstance(self.latency, (int, float)) and not self.jitter and not self.loss.probability:
             return DirectChannel(to_ns(self.latency), gate)
         laws, losses = ([np.random.SeedSequence(seed, spawn_key=(signal, k)) for seed in seeds] for k in (0, 1))

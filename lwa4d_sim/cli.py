@@ -14,7 +14,6 @@ from lwa4d_sim.errors import LwaError, ScenarioError
 app = typer.Typer(
     name="lwa4d-sim",
     help="What a 10 ms CAN bus does to a robot-arm controller: run scenarios, check them, report them.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -70,7 +69,9 @@ def run(
 @app.command()
 def batch(
     places: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Folders of scenarios, or scenario files.")],
-    workers: Annotated[int, typer.Option("-j", "--jobs", metavar="N", min=1, help="Processes; default all CPUs.")] = 0,
+    workers: Annotated[
+        int | None, typer.Option("-j", "--jobs", metavar="N", min=1, help="Processes; default all CPUs.")
+    ] = None,
     junit: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a JUnit file for CI.")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", metavar="DIR", help="Keep the results here.")] = None,
     plots: Annotated[bool, typer.Option("--plots", help="With -o: draw plots and reports as well.")] = False,
@@ -80,9 +81,11 @@ def batch(
 
     Example: lwa4d-sim batch scenarios -j 4 --junit report.xml
     """
-    from lwa4d_sim.batch import default_workers, find_scenarios, run_files, write_junit
+    from lwa4d_sim.batch import check_writable, default_workers, find_scenarios, run_files, write_junit
 
     files = find_scenarios(places)
+    if junit is not None:
+        check_writable(junit)
     jobs = []
     with _progress("scenarios", len(files), quiet=as_json) as advance:
         for job in run_files(files, out, plots=plots and out is not None, workers=workers or default_workers()):
@@ -90,6 +93,9 @@ def batch(
             advance()
     if junit is not None:
         write_junit(junit, jobs)
+    for job in jobs:
+        if job.error:
+            _complain(job.error)
     if as_json:
         rows = [{"file": str(j.file), "verdict": j.verdict, "error": j.error, **(j.summary or {})} for j in jobs]
         print(json.dumps({"scenarios": rows}))
@@ -210,8 +216,6 @@ def _print_jobs(jobs: list[Any]) -> None:
         table.add_row(job.file.stem, job.verdict, states, f"{job.seconds:.1f}")
     Console(width=None if sys.stdout.isatty() else 160).print(table)
     for job in jobs:
-        if job.error:
-            print(job.error)
         for name, variant in (job.summary or {"variants": {}})["variants"].items():
             for check in variant["expect"]["checks"]:
                 if not check["passed"]:
@@ -255,13 +259,24 @@ def _progress(text: str, total: int, *, quiet: bool) -> Iterator[Any]:
 def main() -> None:
     """Entry point: runs the app and turns every expected error into one line and exit code 2."""
     try:
-        app()
-    except LwaError as error:
-        print(f"lwa4d-sim: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("lwa4d-sim: interrupted; finished results are kept", file=sys.stderr)
-        sys.exit(130)
-    except BrokenPipeError:
-        sys.stderr.close()
-        sys.exit(0)
+        code = app(sys.argv[1:] or ["--help"], standalone_mode=False) or 0
+        if code == _INTERRUPTED:
+            _complain("interrupted; finished results are kept")
+    except (LwaError, OSError) as error:
+        code = _complain(str(error))
+    except MemoryError:
+        code = _complain("out of memory; a shorter motion or a longer plant.timestep needs less")
+    except Exception as error:
+        if not hasattr(error, "format_message"):  # Typer's usage errors have no public class
+            raise
+        code = _complain(f"{error.format_message()} (see lwa4d-sim --help)")
+    sys.exit(code)
+
+
+_INTERRUPTED = 130  # Typer's exit code after Ctrl-C, as shells have it
+
+
+def _complain(text: str) -> int:
+    """Print one line on stderr; returns the exit code of bad input."""
+    print(f"lwa4d-sim: {' '.join(text.split())}", file=sys.stderr)
+    return 2

@@ -17,12 +17,13 @@ from lwa4d_sim.interfaces import NS_PER_S, Array, IntArray
 from lwa4d_sim.record import RunLog
 from lwa4d_sim.verdict import segment_word
 
-WIDTH = 8.0  # [in]; at 120 dpi 960 pixels, which a phone can show without losing the labels
-# An axis grows past the calm motion by at most so many times its range, that one wild run may not squash the others: a
-# vibration is worth showing whole, the way of a diverged run to infinity is not.
-ROOM_SHAKING, ROOM_DIVERGED = 10.0, 2.0
+WIDTH = 8.0  # [in]; 960 pixels, enough for a desktop
+TEXT, SMALL = 12.0, 9.5  # [pt]; against this width still readable where a phone shrinks the figure to its screen
+# That one wild run may not squash the others, an axis grows past the calm motion by at most so many times its range, or
+# this share of the wild range if that is more: a vibration is worth seeing whole, a diverged run's way to infinity not.
+ROOM_SHAKING, ROOM_DIVERGED = (10.0, 0.2), (2.0, 0.001)
 BUCKETS = 900  # about the pixels of an axis
-_LINE = 12.0  # [pt] from one small line of text to the next
+_LINE = 13.0  # [pt] from one small line of text to the next
 MAX_NAMED = 8  # more segments than this are not named one by one
 
 # Okabe and Ito (2008), "Color Universal Design", less yellow and black: distinct for every kind of colour vision
@@ -36,7 +37,7 @@ LOOK: list[Any] = [
     {
         "figure.dpi": 120,
         "savefig.dpi": 120,
-        "font.size": 10.5,
+        "font.size": TEXT,
         "axes.grid": True,
         "axes.spines.top": False,
         "axes.spines.right": False,
@@ -103,15 +104,16 @@ class Curve(NamedTuple):
 
 
 def inks(logs: Mapping[str, RunLog]) -> dict[str, Ink]:
-    """A colour for each variant; runs that shake lie below and wide, so that calm ones stay visible."""
+    """A colour for each variant; runs that shake lie lowest, so that calm ones stay visible."""
     out: dict[str, Ink] = {}
+    since_when = {name: log.metrics()["unstable_since"] for name, log in logs.items()}
+    top_down = sorted(logs, key=lambda name: since_when[name] is not None)
     for k, (name, log) in enumerate(logs.items()):
-        since = log.metrics()["unstable_since"]
         # below and wide, above and thin: where two runs agree both can be seen
-        rank = (0 if since is not None else 1) + (1 - k / len(logs))
+        depth = top_down.index(name) / max(1, len(logs) - 1)
         tag = {"ideal": " (ideal)", "can": "_CAN"}.get(name, f"_{plain(name)}")
         colour = PALETTE[k % len(PALETTE)]
-        out[name] = Ink(plain(name), tag, colour, 2.0 - 0.5 * rank, 2 + rank, "-", since, log.diverged_at)
+        out[name] = Ink(plain(name), tag, colour, 1.0 + 1.3 * depth, 3 - depth, "-", since_when[name], log.diverged_at)
     return out
 
 
@@ -136,7 +138,8 @@ def envelope(y: Array, buckets: int = BUCKETS) -> IntArray:
     lowest = starts + np.where(gap, np.inf, stretches).argmin(axis=1)
     highest = starts + np.where(gap, -np.inf, stretches).argmax(axis=1)
     edges = np.flatnonzero(np.diff(np.isnan(y)))
-    return np.unique(np.concatenate([[0], lowest, highest, edges, edges + 1, np.arange(whole, len(y))]))
+    ends = [0, len(y) - 1]
+    return np.unique(np.concatenate([ends, lowest, highest, edges, edges + 1, np.arange(whole, len(y))]))
 
 
 def longest(logs: Iterable[RunLog]) -> RunLog:
@@ -160,16 +163,16 @@ def rows(
     """A figure of stacked panels over time, segments and onsets marked; axes by row, then column."""
     first = next(iter(logs.values()))
     onsets = [(t, text, i.colour) for i in ink.values() for t, text in i.onsets.items()]
-    head = 0.75 + _LINE / 72 * len(onsets)
-    height = head + 0.5 + 1.4 * len(labels)
+    head = 0.82 + _LINE / 72 * len(onsets)
+    height = head + 0.55 + 1.4 * len(labels)
     figure = canvas(title, first, height)
     grid = figure.add_gridspec(
         len(labels),
         columns,
         width_ratios=[1.7, 1][:columns],
-        left=0.1,
+        left=0.135,
         right=0.97,
-        bottom=0.5 / height,
+        bottom=0.55 / height,
         top=1 - head / height,
         hspace=0.14,
         wspace=0.2,
@@ -198,7 +201,7 @@ def _name_segments(ax: Axes, log: RunLog) -> None:
         return
     for k, (start, end) in enumerate(zip([0.0, *log.knots[:-1]], log.knots, strict=True), start=1):
         where: Any = {"transform": ax.get_xaxis_transform(), "ha": "center", "va": "bottom"}
-        ax.text((start + end) / 2, 1.01, f"{segment_word(log.scenario)} {k}", color=GREY, fontsize=8.5, **where)
+        ax.text((start + end) / 2, 1.01, f"{segment_word(log.scenario)} {k}", color=GREY, fontsize=SMALL, **where)
 
 
 def _name_onset(ax: Axes, t: float, text: str, colour: str, k: int) -> None:
@@ -206,19 +209,20 @@ def _name_onset(ax: Axes, t: float, text: str, colour: str, k: int) -> None:
     height = _LINE * (k + 1)
     stem: Any = {"arrowstyle": "-", "color": colour, "lw": 1.2, "ls": "--", "shrinkA": 0, "shrinkB": 0}
     place: Any = {"xycoords": ax.get_xaxis_transform(), "textcoords": "offset points"}
-    ax.annotate("", (t, 1), (0, height + 8), arrowprops=stem, **place)
+    ax.annotate("", (t, 1), (0, height + 9), arrowprops=stem, **place)
     right = t > 0.5 * ax.get_xlim()[1]
-    side: Any = {"ha": "right" if right else "left", "va": "bottom", "fontsize": 8.5, "color": colour}
+    side: Any = {"ha": "right" if right else "left", "va": "bottom", "fontsize": SMALL, "color": colour}
     ax.annotate(text, (t, 1), (-4 if right else 4, height), **side, **place)
 
 
 def draw(axes: Sequence[Sequence[Axes]], curves: Sequence[Curve], unit: str) -> None:
-    """Draw every curve into the first panel of each row, set the limits and mark onsets."""
+    """Draw every curve, as far as it has so many columns, into the first panel of each row, and set the limits."""
     for j, (ax, *_) in enumerate(axes):
-        for ink, t, y in curves:
-            keep = envelope(y[:, j])
-            ax.plot(t[keep], y[keep, j], marker="." if len(t) == 1 else "", **ink.line)
-        _limit(ax, [(ink, t, y[:, j]) for ink, t, y in curves], unit)
+        signals = [(ink, t, y[:, j]) for ink, t, y in curves if j < y.shape[1]]
+        for ink, t, y in signals:
+            keep = envelope(y)
+            ax.plot(t[keep], y[keep], marker="." if len(t) == 1 else "", **ink.line)
+        _limit(ax, signals, unit)
 
 
 def _limit(ax: Axes, signals: Sequence[tuple[Ink, Array, Array]], unit: str) -> None:
@@ -226,26 +230,34 @@ def _limit(ax: Axes, signals: Sequence[tuple[Ink, Array, Array]], unit: str) -> 
     finite = [(ink, t[np.isfinite(y)], y[np.isfinite(y)]) for ink, t, y in signals if np.isfinite(y).any()]
     if not finite:
         return
-    calm = np.concatenate([y if ink.since is None else y[t < ink.since] for ink, t, y in finite])
+    calm = np.concatenate([_calm(*signal) for signal in finite])
     calm = calm if calm.size else np.concatenate([y for _, _, y in finite])
     bottom, top, least, most = calm.min(), calm.max(), calm.min(), calm.max()
     for ink, _, y in finite:
-        room = np.ptp(calm) * (ROOM_SHAKING if ink.diverged_at is None else ROOM_DIVERGED)
+        times, share = ROOM_SHAKING if ink.diverged_at is None else ROOM_DIVERGED
+        room = max(times * np.ptp(calm), share * np.ptp(y))
         bottom, top = min(bottom, max(y.min(), calm.min() - room)), max(top, min(y.max(), calm.max() + room))
         least, most = min(least, y.min()), max(most, y.max())
     margin = max(0.07 * (top - bottom), 1e-6)  # the floor keeps a constant signal from an axis of no height
     ax.set_ylim(bottom - margin, top + margin)
     if most > top:
-        _boxed(ax, 0.95, "top", f"▲ up to {most:.3g} {unit}")
+        _boxed(ax, 0.92, "top", f"▲ up to {most:.3g} {unit}")
     if least < bottom:
-        _boxed(ax, 0.05, "bottom", f"▼ down to {least:.3g} {unit}")
+        _boxed(ax, 0.08, "bottom", f"▼ down to {least:.3g} {unit}")
+
+
+def _calm(ink: Ink, t: Array, y: Array) -> Array:
+    """What of a signal shows its ordinary range."""
+    if ink.diverged_at is not None:  # it may have grown for long before it was found to be unstable
+        return np.quantile(y, [0.25, 0.75])
+    return y if ink.since is None else y[t < ink.since]
 
 
 def _boxed(ax: Axes, height: float, side: str, text: str) -> None:
     """Small text at the left edge of a panel that stays readable on top of lines."""
     box = {"facecolor": "white", "alpha": 0.8, "pad": 0.8, "linewidth": 0}
     place: Any = {"transform": ax.transAxes, "va": side}
-    ax.text(0.006, height, text, bbox=box, fontsize=8.5, color=GREY, zorder=6, **place)
+    ax.text(0.006, height, text, bbox=box, fontsize=SMALL, color=GREY, zorder=6, **place)
 
 
 def legend(figure: Figure, entries: Iterable[tuple[str, Ink]]) -> None:
@@ -254,7 +266,7 @@ def legend(figure: Figure, entries: Iterable[tuple[str, Ink]]) -> None:
     figure.legend(
         handles=handles,
         loc="upper left",
-        bbox_to_anchor=(0.01, 1 - 0.3 / figure.get_figheight()),
+        bbox_to_anchor=(0.01, 1 - 0.33 / figure.get_figheight()),
         ncols=min(6, len(handles)),
         borderaxespad=0,
         borderpad=0.2,

@@ -35,8 +35,12 @@ class Motion(Protocol):
         """Step under torque (N, 1 or steps, n); None is braked. Returns q and dq (N, steps, n), reused arrays."""
         ...
 
+    def give_up(self, arms: Any) -> None:
+        """Count the arms of a mask (N,) as lost."""
+        ...
+
     def diverged(self) -> Any:
-        """Mask (N,) of arms lost since the last call."""
+        """Mask (N,) of arms lost since the last call, or None."""
         ...
 
 
@@ -106,7 +110,7 @@ class Tick:
         age: age of the data it used [ns], (N, n), or None.
         q, dq: plant states (N, steps, n) at the end of each plant step of the period.
         tau: torque (N, steps or 1, n) on the joints during each step; NaN while the brakes are closed.
-        lost: mask (N,) of arms that diverged in this period.
+        lost: mask (N,) of arms found to have diverged, or None.
     """
 
     k: int
@@ -157,8 +161,12 @@ class ArmSide:
         arrived = down.newest(now)
         return None if arrived is None else self._drives.torque(arrived, now, steps)
 
+    def give_up(self, arms: Any) -> None:
+        """Count the arms of a mask (N,) as lost."""
+        self._plant.give_up(arms)
+
     def diverged(self) -> Any:
-        """Mask (N,) of arms lost since the last call."""
+        """Mask (N,) of arms lost since the last call, or None."""
         return self._plant.diverged()
 
 
@@ -218,6 +226,8 @@ def simulate(arm: ArmSide, control: ControllerSide, link: Link, timing: Timing, 
             state, command = control.tick(arrived, now, k, start)
             age = now - arrived.stamp
             link.down.send(now, (command,))
+            if np.isnan(command.sum()):  # a torque that is no number, from a state that is one, is no closed brake
+                arm.give_up(np.isnan(command).any(axis=1) & ~np.isnan(state.q).any(axis=1))
         q, dq, tau = arm.advance(link.down, now, after)
         if head is not None:
             q, dq, tau = (np.concatenate(pair, axis=1) for pair in zip(head, _full((q, dq, tau)), strict=True))

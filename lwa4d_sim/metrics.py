@@ -16,6 +16,7 @@ SMOOTH_WINDOW = 0.4  # [s] motion that a cubic over this window follows is motio
 VIBRATION_FLOOR = 0.02  # [rad/s] rms below which nobody would see or hear it
 VIBRATION_LIMIT = 0.4  # [rad/s] rms that is unstable in any case: the rated speed of the slow joints
 DECAY = 0.9  # a vibration that keeps more than this from one window to the next does not decay
+_COARSE = 5_000_000  # [ns] 100 Hz is beyond any arm's motion
 SETTLED = 0.02  # of the segment's distance: the usual 2 % band
 
 #: name, unit and meaning of every metric, for reports and for the keys of `expect`
@@ -45,37 +46,39 @@ def metrics(log: "RunLog") -> dict[str, Any]:
 
     A run that diverged is measured up to that instant.
     """
-    x, x_ref = log.x, log.x_ref
-    error = np.linalg.norm(x - x_ref, axis=1)
-    last = [log.step_at(end) for end in log.knots]
-    complete = [step < len(error) for step in last]
     vibration, since = vibrations(log)
+    x, x_ref = log.x, log.x_ref
+    # where the tool should be at the end of each segment it has reached: the sample before the knot, for a step
+    # reference jumps at the knot itself
+    goals = [x_ref[max(0, end - 1)].copy() if end < len(x) else None for _, end in _segments(log)]
+    x_ref -= x  # in place: the paths are a tenth of a long record each
+    error = np.sqrt(np.einsum("ij,ij->i", x_ref, x_ref))
+    del x_ref
     ticks = log.ticks
     joint_error = ticks.q_ref - ticks.q_true
+    known = ~np.isnan(ticks.dq).any(axis=1)
     tail = log.tau[-min(len(log.tau), round(NS_PER_S / log.timestep)) :]
     diverged = log.diverged_at
     values: dict[str, Any] = {
         "stable": diverged is None and since is None,
         "unstable_since": since if since is not None else diverged,
         "diverged_at": diverged,
-        # against the sample before the knot: a step reference jumps at the knot itself
-        "final_error": [
-            float(np.linalg.norm(x[k] - x_ref[k - 1])) if ok else None for k, ok in zip(last, complete, strict=True)
-        ],
+        # both at the sample before the knot, so that perfect tracking of a moving end has no error
+        "final_error": [float(error[max(0, end - 1)]) if end < len(x) else None for _, end in _segments(log)],
         "max_error": float(error.max()),
         "rms_error": _rms(error),
-        "settling_time": _settling(log, x, x_ref),
+        "settling_time": _settling(log, x, goals),
         "max_joint_error": _per_joint(np.abs(joint_error), np.max),
         "rms_joint_error": _per_joint(joint_error**2, np.mean, np.sqrt),
-        "velocity_error_rms": _per_joint((ticks.dq - ticks.dq_true) ** 2, np.mean, np.sqrt),
+        "velocity_error_rms": _per_joint((ticks.dq - ticks.dq_true)[known] ** 2, np.mean, np.sqrt),
         "peak_torque": _peaks(log.tau),
         "torque_ripple": _per_joint(tail, np.ptp),
         "peak_speed": _peaks(log.dq),
         "vibration": vibration,
         "saturation_fraction": float(np.mean((log.tau >= log.tau_max) | (log.tau <= -log.tau_max))),
-        "data_age_max": float(ticks.age.max()) if ticks.age.size else None,
+        "data_age_max": _largest(ticks.age),
     }
-    return values
+    return {key: _finite(value) for key, value in values.items()}
 
 
 def deviation(log: "RunLog", other: "RunLog") -> list[float | None]:
@@ -88,19 +91,31 @@ def deviation(log: "RunLog", other: "RunLog") -> list[float | None]:
     return out
 
 
+def _finite(value: Any) -> Any:
+    """The value, with None for numbers that do not exist."""
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _largest(values: Array) -> float | None:
+    """Largest of the values that are not NaN."""
+    known = values[~np.isnan(values)]
+    return float(known.max()) if known.size else None
+
+
 def _segments(log: "RunLog") -> list[tuple[int, int]]:
     ends = [log.step_at(end) for end in log.knots]
     return list(zip([0, *ends[:-1]], ends, strict=True))
 
 
-def _settling(log: "RunLog", x: Array, x_ref: Array) -> list[float | None]:
+def _settling(log: "RunLog", x: Array, goals: list[Array | None]) -> list[float | None]:
     """Per segment, the time from its start after which the tool stays in the band around the segment's end point."""
     out: list[float | None] = []
-    for start, end in _segments(log):
-        if end >= len(x):
+    for goal, (start, end) in zip(goals, _segments(log), strict=True):
+        if goal is None:
             out.append(None)
             continue
-        goal = x_ref[end - 1]
         distance = np.linalg.norm(x[start : end + 1] - goal, axis=1)
         band = SETTLED * float(distance[0])
         outside = np.flatnonzero(distance > band)
@@ -118,13 +133,14 @@ def _settling(log: "RunLog", x: Array, x_ref: Array) -> list[float | None]:
 def vibrations(log: "RunLog") -> tuple[list[float | None], float | None]:
     """Vibration at the end of each segment [rad/s], worst joint, and the onset of instability [s] or None.
 
-    Vibration is what a cubic fitted over `SMOOTH_WINDOW` (Savitzky and Golay 1964) leaves of the joint speed. A segment
-    is unstable when, in its last second (or quarter), the vibration is above the floor and has not decayed against the
-    stretch before, or is above the limit anyway. The onset is the start of the stretch in which the running rms stays
-    above the floor.
+    Vibration is what a cubic fitted over `SMOOTH_WINDOW` (Savitzky and Golay 1964) leaves of the joint speed; a segment
+    of less than a second has none that could be told from motion. A segment is unstable when, in its last second (or
+    quarter), the vibration is above the floor and has not decayed against the stretch before, or is above the limit
+    anyway. The onset is the start of the stretch in which the running rms stays above the floor.
     """
-    # half a control period resolves every frequency the loop can have
-    stride = max(1, min(int(log.period // log.timestep) // 2, round(0.005 * NS_PER_S / log.timestep)))
+    # half a control period resolves every frequency a sampled loop can have; the ideal loop has none of its own
+    finest = log.period // 2 if log.period > log.timestep else _COARSE
+    stride = max(1, min(finest, _COARSE) // log.timestep)
     h = stride * log.timestep / NS_PER_S
     half = max(2, round(0.5 * SMOOTH_WINDOW / h))
     signal = _detrended(log.dq[::stride], half)
@@ -136,7 +152,10 @@ def vibrations(log: "RunLog") -> tuple[list[float | None], float | None]:
             values.append(None)
             continue
         # the fit looks half a window ahead and must not see the next segment's jump
-        a, b = start // stride, max(start // stride + 8, end // stride - half)
+        a, b = start // stride, end // stride - half
+        if b - a < 4 * half:
+            values.append(None)
+            continue
         window = max(2, min(round(1.0 / h), (b - a) // 4))
         # per joint, so that a mode moving from one joint to another is not mistaken for decay
         before = np.sqrt(np.mean(signal[b - 2 * window : b - window] ** 2, axis=0))
@@ -159,11 +178,11 @@ def _onset(power: Array, window: int, h: float) -> int:
 def _detrended(signal: Array, half: int) -> Array:
     """``signal`` (T, n) minus its cubic fit over 2 half + 1 samples; beyond the ends the end values go on."""
     if len(signal) <= 2 * half:
-        return signal - signal.mean(axis=0)
+        return np.asarray(signal - signal.mean(axis=0))
     padded = np.concatenate([np.repeat(signal[:1], half, 0), signal, np.repeat(signal[-1:], half, 0)])
     kernel = _smoothing_kernel(half)
     smooth = np.stack([np.convolve(column, kernel, mode="valid") for column in padded.T], axis=1)
-    return signal - smooth
+    return np.asarray(signal - smooth)
 
 
 @lru_cache(maxsize=8)

@@ -1,6 +1,7 @@
 """Reads an MJCF arm, checks that it is one, and applies a scenario's physical changes."""
 
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -109,7 +110,7 @@ def load_model(
     base: Path | None = None,
     tool_body: bool = False,
 ) -> mujoco.MjModel:
-    """Compile a shipped arm or an MJCF file with ``edits`` applied.
+    """Compile a shipped arm or an MJCF file with ``edits`` applied; callers share the model and must not change it.
 
     The automatic reset of a diverging simulation is switched off, so that a diverged run stays visible.
 
@@ -126,9 +127,25 @@ def load_model(
             fit the arm; or its viscous friction is too stiff for an explicit integrator at this step.
     """
     path = model_path(name_or_path, base)
+    # a subclass's other settings are no part of the arm, nor of the key under which it is kept
+    plain = ArmEdits(**{f.name: getattr(edits, f.name) for f in fields(ArmEdits)})
+    return _load(path, path.stat().st_mtime_ns, name_or_path, plain, timestep, integrator, tool_body)
+
+
+@lru_cache(maxsize=64)
+def _load(
+    path: Path,
+    modified: int,  # part of the key, so that an edited file is read again
+    name_or_path: str,
+    edits: ArmEdits,
+    timestep: float | None,
+    integrator: str | None,
+    tool_body: bool,
+) -> mujoco.MjModel:
+    """`load_model`, once for each file and set of edits: a batch of a thousand arms has few different ones."""
     try:
         spec = mujoco.MjSpec.from_file(str(path))
-        if tool_body or any(getattr(edits, f.name) != f.default for f in fields(ArmEdits)):
+        if tool_body or edits != _AS_IT_IS:
             plain = spec.compile()
             check_arm(plain)
             _edit(spec, plain, edits, name_or_path)

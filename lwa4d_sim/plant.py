@@ -14,8 +14,6 @@ from lwa4d_sim.interfaces import Array, NonNegative, Positive, to_ns
 
 # A joint this fast is no arm any more (assumed: about a thousand times the fastest joint of the LWA4D).
 SPEED_LIMIT = 1000.0  # [rad/s]
-# Divergence is looked for every this many plant steps: often enough to stop soon, seldom enough to cost nothing.
-CHECK_EVERY = 10
 
 _Vector = tuple[float, float, float]
 
@@ -70,8 +68,7 @@ class Plant:
         self._edges = sorted({edge for window in self._disturbances for edge in (window.first, window.last)})
         self._step = 0
         self._records: dict[int, dict[str, Array]] = {}
-        self._next_check = 0
-        self._none = np.zeros(len(q0), bool)
+        self._given_up: Any = None
         self.running = np.ones(len(q0), bool)
         self._all_running = True
         self.q[:] = q0
@@ -102,15 +99,19 @@ class Plant:
             self._apply_wrenches()
         return np.concatenate([p[0] for p in pieces], axis=1), np.concatenate([p[1] for p in pieces], axis=1)
 
+    def give_up(self, arms: Any) -> None:
+        """Count the arms of a mask (N,) as lost, whatever their state."""
+        self._given_up = arms if self._given_up is None else self._given_up | arms
+
     def diverged(self) -> Any:
-        """Mask (N,) of arms found to have left all bounds since the last call; they stand still from now on."""
-        if self._step < self._next_check:
-            return self._none
-        self._next_check = self._step + CHECK_EVERY
+        """Mask (N,) of arms found to have left all bounds since the last call, or None; they stand still from now on."""
         speed = np.abs(self.dq)
-        if speed.max() < SPEED_LIMIT and not self._warnings.any():  # False for NaN
-            return self._none
-        lost = self.running & ((self._warnings.sum(axis=1) > 0) | ~(speed.max(axis=1) < SPEED_LIMIT))
+        if speed.max() < SPEED_LIMIT and self._given_up is None and not self._warnings.any():  # False for NaN
+            return None
+        lost = ~(speed.max(axis=1) < SPEED_LIMIT) | self._warnings.any(axis=1)
+        if self._given_up is not None:
+            lost |= self._given_up
+        lost &= self.running
         self.running &= ~lost
         self._all_running = bool(self.running.all())
         self.q[lost], self.dq[lost] = 0.0, 0.0

@@ -15,6 +15,7 @@ from lwa4d_sim.drawing import (
     GREY,
     LOOK,
     REFERENCE,
+    SMALL,
     Curve,
     Ink,
     Picture,
@@ -85,8 +86,8 @@ def _rank(stem: str) -> int:
     return ranks[0] if ranks else len(_ORDER)
 
 
-def _joints(symbol: str, log: RunLog, unit: str) -> list[str]:
-    return [f"{symbol}{j + 1} [{unit}]" for j in range(log.q.shape[1])]
+def _joints(symbol: str, logs: Iterable[RunLog], unit: str) -> list[str]:
+    return [f"{symbol}{j + 1} [{unit}]" for j in range(max(log.q.shape[1] for log in logs))]
 
 
 def _entries(symbol: str, ink: Iterable[Ink]) -> list[tuple[str, Ink]]:
@@ -102,16 +103,16 @@ def _tool(logs: _Logs, ink: _Inks) -> _Made:
     legend(figure, _entries("X", [REFERENCE, *ink.values()]))
     caption = (
         "Where the tool is, in base axes. The dashed line is where it should be; a good run ends every segment on it. "
-        "Dotted lines part the segments of the motion. Where two variants lie on each other the bus does no harm; "
-        "where one leaves the other, look at the torques at the same instant."
+        "Dotted lines part the segments of the motion."
     )
+    if len(logs) > 1:
+        caption += " Where one variant leaves the others, look at the torques and the joint speeds at the same instant."
     yield "tool", title, caption, figure
 
 
 def _torques(logs: _Logs, ink: _Inks) -> _Made:
     title = "Applied torque"
-    log = next(iter(logs.values()))
-    figure, axes = rows(logs, ink, title, _joints("τ", log, "N m"))
+    figure, axes = rows(logs, ink, title, _joints("τ", logs.values(), "N m"))
     draw(axes, [Curve(ink[name], log.t, log.tau) for name, log in logs.items()], "N m")
     # a list, not a generator: every panel has to be marked
     reached = any([_limit_marks(ax, logs, ink, j) for j, (ax,) in enumerate(axes)])  # noqa: C419
@@ -133,8 +134,10 @@ def _limit_marks(ax: Axes, logs: _Logs, ink: _Inks, j: int) -> bool:
     """Mark where joint ``j`` is at its torque limit; whether it ever is."""
     reached = False
     for name, log in logs.items():
+        if j >= len(log.tau_max):
+            continue
         limit, low_high = log.tau_max[j], ax.get_ylim()
-        for sign, height in ((1, 0.96), (-1, 0.0)):
+        for sign, edge in ((1, 0.94), (-1, 0.0)):
             on = sign * log.tau[:, j] >= limit
             if not on.any():
                 continue
@@ -144,7 +147,8 @@ def _limit_marks(ax: Axes, logs: _Logs, ink: _Inks, j: int) -> bool:
             widths = np.maximum(ends - starts, ax.get_xlim()[1] / 900)  # at least a pixel, or it would vanish
             spans = np.stack([starts, widths], axis=1).tolist()
             place: Any = ax.get_xaxis_transform()
-            ax.broken_barh(spans, (height, 0.04), transform=place, color=ink[name].colour, lw=0, zorder=4)
+            ax.broken_barh([ax.get_xlim()], (edge, 0.06), transform=place, color="white", lw=0, zorder=3.9)
+            ax.broken_barh(spans, (edge + 0.01, 0.04), transform=place, color=ink[name].colour, lw=0, zorder=4)
             if low_high[0] < sign * limit < low_high[1]:
                 ax.axhline(sign * limit, color=BLACK, lw=0.9, ls="-.", zorder=1.5)
     return reached
@@ -155,7 +159,7 @@ def _joint_error(logs: _Logs, ink: _Inks) -> _Made:
     if not any(len(curve.t) for curve in curves):
         return
     title = "Joint error"
-    figure, axes = rows(logs, ink, title, _joints("e", next(iter(logs.values())), "rad"))
+    figure, axes = rows(logs, ink, title, _joints("e", logs.values(), "rad"))
     draw(axes, curves, "rad")
     legend(figure, _entries("e", ink.values()))
     caption = (
@@ -169,7 +173,7 @@ def _velocity(logs: _Logs, ink: _Inks) -> _Made:
     sampled = {name: log for name, log in logs.items() if log.period > log.timestep and len(log.ticks.t)}
     for name, log in sampled.items():
         title = "Joint speed: estimate and truth" + (f" ({name})" if len(sampled) > 1 else "")
-        figure, axes = rows({name: log}, {name: ink[name]}, title, _joints("dq", log, "rad/s"), columns=2)
+        figure, axes = rows({name: log}, {name: ink[name]}, title, _joints("dq", [log], "rad/s"), columns=2)
         truth = replace(ink[name], colour=BLACK, width=1.4, layer=2)
         guess = replace(ink[name], width=1.0, layer=3)
         ticks = log.ticks
@@ -182,13 +186,13 @@ def _velocity(logs: _Logs, ink: _Inks) -> _Made:
             zoom.plot(log.t[near], log.dq[near, j], **truth.line)
             zoom.step(ticks.t[at], ticks.dq[at, j], where="post", marker=".", ms=5, **guess.line)
             zoom.set_xlim(start, start + ZOOM)
-        axes[0][1].set_title(f"the most violent {ZOOM} s", fontsize=8.5, color=GREY, pad=3)
+        axes[0][1].set_title(f"the most violent {ZOOM} s", fontsize=SMALL, color=GREY, pad=3)
         legend(figure, [("dq, true", truth), (f"dq{ink[name].tag}, estimate", guess)])
         caption = (
-            "The joint speed that the controller believed at its ticks, in colour, against the true one, in black. On "
-            f"the right the grey stripe of the left, the {ZOOM} s in which the arm moved most violently: each dot is a "
-            "tick, held until the next. The farther the steps trail behind the black line, the later the damping acts, "
-            "and damping that comes too late drives a vibration on instead of ending it."
+            "The joint speed that the controller believed at its ticks, in colour, against the true one. On the right "
+            f"the grey stripe of the left, the {ZOOM} s in which the arm moved most violently: each dot is a tick, "
+            "held until the next. The farther the steps trail behind the smooth line, the later the damping acts, and "
+            "damping that comes too late drives a vibration on instead of ending it."
         )
         yield "velocity" if len(sampled) == 1 else f"velocity_{name}", title, caption, figure
 
@@ -207,8 +211,8 @@ def _violent(log: RunLog) -> float:
 def _path(logs: _Logs, ink: _Inks) -> _Made:
     title = "Path of the tool"
     log = longest(logs.values())
-    figure = canvas(title, log, 6.0)
-    ax: Any = figure.add_axes((0.0, 0.02, 1.0, 0.88), projection="3d", computed_zorder=False)
+    figure = canvas(title, log, 6.2)
+    ax: Any = figure.add_axes((0.0, 0.04, 1.0, 0.88), projection="3d", computed_zorder=False)
     reference = log.x_ref
     steps = np.linalg.norm(np.diff(reference, axis=0), axis=1)
     jumps = steps > JUMP_SPEED * log.timestep / NS_PER_S
@@ -251,10 +255,10 @@ def _to_scale(ax: Any, points: Array) -> None:
     half = 0.525 * np.maximum(high - low, max(0.1 * float((high - low).max()), 1e-3))
     for axis, centre, reach in zip("xyz", (low + high) / 2, half, strict=True):
         ax.set(**{f"{axis}lim": (centre - reach, centre + reach), f"{axis}label": f"{axis} [m]"})
-    ax.set_box_aspect(half, zoom=1.08)
+    ax.set_box_aspect(half, zoom=0.98)
     ax.locator_params(nbins=5)
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
-        axis.labelpad = 9
+        axis.labelpad = 10
 
 
 def _age(logs: _Logs, ink: _Inks) -> _Made:

@@ -2,7 +2,8 @@
 
 import json
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -86,7 +87,7 @@ class RunLog:
     @property
     def t(self) -> Array:
         """Instants of the plant samples (T,) [s]."""
-        return np.arange(len(self.q)) * (self.timestep / NS_PER_S)
+        return np.asarray(np.arange(len(self.q)) * (self.timestep / NS_PER_S), float)
 
     @property
     def x(self) -> Array:
@@ -121,8 +122,9 @@ class RunLog:
             with _open(partial, "w") as file:
                 self._write(file)
             os.replace(partial, path)
-        except OSError as error:
-            partial.unlink(missing_ok=True)
+        except (OSError, RuntimeError) as error:  # h5py raises either
+            with suppress(OSError):
+                partial.unlink()
             raise RecordError(f"{path}: cannot write the record ({error})") from error
 
     def _write(self, file: Any) -> None:
@@ -142,8 +144,9 @@ class RunLog:
         _write_group(file, "ticks", {key: (getattr(self.ticks, key), unit) for key, unit in _TICK_UNITS.items()})
         parameters = {"knots": (self.knots, "s"), "tau_max": (self.tau_max, "N m")}
         _write_group(file, "parameters", parameters)
-        file["parameters"].attrs["scenario"] = json.dumps(self.scenario)
-        file["parameters"].attrs["versions"] = json.dumps(self.versions)
+        for key, text in (("scenario", self.scenario), ("versions", self.versions)):
+            # not attributes, which HDF5 limits to 64 kB
+            file["parameters"].create_dataset(key, data=json.dumps(text), dtype=_text_type())
         events = file.create_group("events")
         events.create_dataset("t", data=np.array([t for t, _ in self.events])).attrs["unit"] = "s"
         events.create_dataset("text", data=[text for _, text in self.events], dtype=_text_type())
@@ -158,12 +161,12 @@ class RunLog:
         try:
             with _open(path, "r") as file:
                 return _read(file)
-        except (OSError, KeyError, ValueError) as error:
+        except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:  # as many as ways to be wrong
             raise RecordError(f"{path}: not a readable run record ({error})") from error
 
 
 class Paths(Protocol):
-    """Where the tool was and should have been: computed for a fresh run, stored in a loaded one."""
+    """Where the tool was and should have been: computed for a fresh run, stored in a loaded one; always new arrays."""
 
     def x(self, q: Array) -> Array:
         """Tool points (T, 3) [m]."""
@@ -182,18 +185,23 @@ class ComputedPaths:
     trajectory: Trajectory
 
     def x(self, q: Array) -> Array:
-        return _in_blocks(self.kinematics.point, q)
+        """Tool points (T, 3) [m]."""
+        return in_blocks(self.kinematics.point, q)
 
     def x_ref(self, t: Array) -> Array:
-        return _in_blocks(self.trajectory.tool_point, t)
+        """Desired tool points (T, 3) [m]."""
+        return in_blocks(self.trajectory.tool_point, t)
 
 
-def _in_blocks(function: Callable[[Array], Array], samples: Array, size: int = 2000) -> Array:
-    """``function`` of many samples, a block at a time, so that its scratch arrays stay small."""
-    out = np.empty((len(samples), 3))
+def in_blocks(function: Callable[[Array], Array], samples: Array, size: int = 500) -> Array:
+    """``function`` of many samples, a block at a time, so that its scratch arrays stay small beside the record."""
+    out: Array | None = None
     for start in range(0, len(samples), size):
-        out[start : start + size] = function(samples[start : start + size])
-    return out
+        block = function(samples[start : start + size])
+        if out is None:
+            out = np.empty((len(samples), *block.shape[1:]))
+        out[start : start + size] = block
+    return function(samples) if out is None else out
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,10 +212,12 @@ class StoredPaths:
     stored_x_ref: Array
 
     def x(self, q: Array) -> Array:
-        return self.stored_x
+        """Tool points (T, 3) [m]."""
+        return self.stored_x.copy()
 
     def x_ref(self, t: Array) -> Array:
-        return self.stored_x_ref
+        """Desired tool points (T, 3) [m]."""
+        return self.stored_x_ref.copy()
 
 
 _TICK_UNITS = {
@@ -244,7 +254,6 @@ def _read(file: Any) -> RunLog:
     if file.attrs.get("format") != FORMAT:
         raise ValueError(f"format {file.attrs.get('format')}, this version reads {FORMAT}")
     plant, parameters, events = file["plant"], file["parameters"], file["events"]
-    diverged: Iterable[float] = [float(file.attrs["diverged_at"])] if "diverged_at" in file.attrs else []
     return RunLog(
         name=str(file.attrs["name"]),
         variant=str(file.attrs["variant"]),
@@ -257,9 +266,9 @@ def _read(file: Any) -> RunLog:
         knots=parameters["knots"][:],
         tau_max=parameters["tau_max"][:],
         seed=int(file.attrs["seed"]),
-        diverged_at=next(iter(diverged), None),
+        diverged_at=float(file.attrs["diverged_at"]) if "diverged_at" in file.attrs else None,
         events=tuple(zip(events["t"][:].tolist(), [s.decode() for s in events["text"][:]], strict=True)),
-        scenario=json.loads(parameters.attrs["scenario"]),
-        versions=json.loads(parameters.attrs["versions"]),
+        scenario=json.loads(parameters["scenario"][()]),
+        versions=json.loads(parameters["versions"][()]),
         paths=StoredPaths(plant["x"][:], plant["x_ref"][:]),
     )

@@ -9,7 +9,7 @@ import numpy as np
 from lwa4d_sim.interfaces import NS_PER_S, Array, Ns, Trajectory
 from lwa4d_sim.loop import Tick, Timing
 from lwa4d_sim.plant import SPEED_LIMIT
-from lwa4d_sim.record import ComputedPaths, RunLog, TickLog, ToolPoint
+from lwa4d_sim.record import ComputedPaths, RunLog, TickLog, ToolPoint, in_blocks
 
 # Joint errors need the reference only this often; inverse kinematics at every plant step would cost more than the run.
 _REFERENCE_PERIOD = 10_000_000  # [ns]
@@ -36,7 +36,7 @@ class _Seen:
     q: Array
     dq: Array
     tau: Array
-    age: Array  # (N, kept) [s]
+    age: Array  # (N, kept) [ns]
 
     @staticmethod
     def blank(n_sims: int, kept: int, n: int) -> "_Seen":
@@ -51,8 +51,7 @@ class _Seen:
         if tick.state is None or tick.command is None or tick.age is None:
             return
         self.q[:, k], self.dq[:, k], self.tau[:, k] = tick.state.q, tick.state.dq, tick.command
-        heard = ~np.isnan(tick.state.q[:, 0])
-        self.age[:, k] = np.where(heard, tick.age.max(axis=1) / NS_PER_S, np.nan)
+        self.age[:, k] = tick.age.max(axis=1)
 
     def log(self, i: int, q: Array, dq: Array, t: Array, trajectory: Trajectory, *, exact: bool) -> TickLog:
         """Of simulation ``i``, with the arm's own q and dq at the ticks; ``exact`` says the controller saw just those."""
@@ -62,10 +61,10 @@ class _Seen:
             q=q if exact else self.q[i, :kept],
             dq=dq if exact else self.dq[i, :kept],
             tau=self.tau[i, :kept],
-            age=self.age[i, :kept],
+            age=np.where(np.isnan(self.q[i, :kept, 0]), np.nan, self.age[i, :kept] / NS_PER_S),
             q_true=q,
             dq_true=dq,
-            q_ref=trajectory.joint(t).q,
+            q_ref=in_blocks(lambda block: trajectory.joint(block).q, t),
         )
 
 
@@ -105,7 +104,7 @@ def record(
         tau[:, start : start + per_tick] = tick.tau
         if tick.k % stride == 0:
             seen.take(tick, tick.k // stride)
-        if tick.lost.any():
+        if tick.lost is not None:
             end[tick.lost] = start + per_tick + 1
             running &= ~tick.lost
             if not running.any():
@@ -116,7 +115,7 @@ def record(
         stop, diverged = _last_good(q[i], dq[i], int(end[i]), total, timestep)
         braked_steps = np.isnan(tau[i, :stop]).any(axis=1)
         events = _events(braked_steps, diverged, timestep)
-        np.nan_to_num(tau[i], copy=False)
+        tau[i, :stop][braked_steps] = 0.0
         first, step = timing.phase // timestep, stride * per_tick
         at = np.arange(first, stop, step)[: seen.count]
         logs.append(

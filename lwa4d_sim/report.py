@@ -20,6 +20,8 @@ from lwa4d_sim.record import RunLog
 from lwa4d_sim.verdict import Run, headline, remarks
 
 _T = TypeVar("_T")
+_KINDS: Mapping[type, str] = {dict: "a mapping", list: "a list", str: "text", bool: "true or false"}
+NONE = "\u2013"  # an en dash stands for a number that does not exist
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +123,10 @@ def section_from_folder(folder: Path) -> Section:
     for name, variant in variants.items():
         at = f"{path}: variant '{name}'"
         checks = _entry(_entry(variant, "expect", dict, at), "checks", list, at)
-        outcomes = [Outcome(*(_entry(check, key, object, at) for key in _OUTCOME)) for check in checks]
+        outcomes = [
+            Outcome(_entry(c, "key", str, at), c.get("bound"), c.get("value"), _entry(c, "passed", bool, at))
+            for c in checks
+        ]
         runs[name] = Run.of(logs[name], _entry(variant, "metrics", dict, at), outcomes)
     return Section(
         title=_entry(summary, "name", str, path),
@@ -134,14 +139,10 @@ def section_from_folder(folder: Path) -> Section:
     )
 
 
-_OUTCOME = ("key", "bound", "value", "passed")
-
-
 def _entry(data: Any, key: str, kind: type[_T], where: Any) -> _T:
     value = data.get(key) if isinstance(data, dict) else None
-    if not isinstance(data, dict) or key not in data or not isinstance(value, kind):
-        wanted = {dict: "a mapping", list: "a list", str: "text"}.get(kind, "a value")
-        raise RecordError(f"{where}: '{key}' is missing or not {wanted}; run the scenario again")
+    if not isinstance(value, kind):
+        raise RecordError(f"{where}: '{key}' is missing or not {_KINDS[kind]}; run the scenario again")
     return value
 
 
@@ -171,9 +172,9 @@ def _embed(figure: Picture) -> str:
 
 
 def number(value: Any) -> str:
-    """A metric as a table shows it: three digits, lists with commas, – for what does not exist."""
+    """A metric as a table shows it: three digits, lists with commas, a dash for what does not exist."""
     if value is None:
-        return "–"
+        return NONE
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, (list, tuple)):

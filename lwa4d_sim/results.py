@@ -17,6 +17,8 @@ from lwa4d_sim.record import RunLog
 from lwa4d_sim.runner import measure, run_all, versions
 from lwa4d_sim.scenario import Scenario
 
+_OURS = (".gif", ".h5", ".html", ".json", ".png")  # what a run's folder may hold, and what its next run replaces
+
 
 def run_scenario(scenario: Scenario, out: Path | None = None, *, plots: bool = False) -> dict[str, Any]:
     """Run all variants, check expectations and, with ``out``, write the folder ``out/NAME``.
@@ -52,7 +54,7 @@ def summarise(scenario: Scenario, logs: Mapping[str, RunLog]) -> dict[str, Any]:
             "expect": {"passed": all(check.passed for check in checks), "checks": [asdict(check) for check in checks]},
             "seed": logs[name].seed,
         }
-    arm = scenario.document["arm"]
+    arms = sorted({settings.arm for settings in scenario.variants.values()})
     return {
         "name": scenario.name,
         "variants": variants,
@@ -64,7 +66,7 @@ def summarise(scenario: Scenario, logs: Mapping[str, RunLog]) -> dict[str, Any]:
         "hashes": {
             "scenario": _hash(scenario.text.encode()),
             "document": _hash(json.dumps(scenario.document, sort_keys=True).encode()),
-            "model": _hash(model_path(arm, scenario.folder).read_bytes()),
+            "models": {arm: _hash(model_path(arm, scenario.folder).read_bytes()) for arm in arms},
         },
     }
 
@@ -86,21 +88,27 @@ def _claim(out: Path, name: str) -> Path:
     """
     folder = out / name
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out):
+        # the nearest folder that is there already, so that bad input leaves not even an empty folder behind
+        with tempfile.TemporaryFile(dir=next(place for place in (out, *out.absolute().parents) if place.exists())):
             pass
-        foreign = folder.exists() and not (folder / "summary.json").is_file() and any(folder.iterdir())
+        foreign = (
+            next((entry for entry in folder.iterdir() if entry.suffix not in _OURS), None) if folder.exists() else None
+        )
     except OSError as error:
-        raise ScenarioError(f"{out}: cannot write results here: {error.strerror}; choose another folder with -o") from error
-    if foreign:
-        raise ScenarioError(f"{folder}: exists and is not a run's folder; choose another with -o, or move it away")
+        raise ScenarioError(
+            f"{out}: cannot write results here: {error.strerror}; choose another folder with -o"
+        ) from error
+    if foreign is not None:
+        raise ScenarioError(f"{folder}: holds '{foreign.name}', which no run wrote; choose another folder with -o")
     return folder
 
 
 def _write(folder: Path, scenario: Scenario, logs: Mapping[str, RunLog], summary: dict[str, Any], plots: bool) -> None:
     """Write into a temporary folder beside ``folder`` and put it in place when all is there."""
-    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent))
+    partial = None
     try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent))
         partial.chmod(0o755)
         for name, log in logs.items():
             log.save(partial / f"{name}.h5")
@@ -113,10 +121,11 @@ def _write(folder: Path, scenario: Scenario, logs: Mapping[str, RunLog], summary
             retired = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".old", dir=folder.parent))
             os.replace(folder, retired / folder.name)
             os.replace(partial, folder)
-            shutil.rmtree(retired)
+            shutil.rmtree(retired, ignore_errors=True)
         else:
             os.replace(partial, folder)
     except OSError as error:
         raise RecordError(f"{folder}: cannot write the results ({error})") from error
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        if partial is not None:
+            shutil.rmtree(partial, ignore_errors=True)

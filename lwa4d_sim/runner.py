@@ -50,7 +50,7 @@ def run(scenario: Scenario, variant: str | None = None) -> RunLog:
         ModelError, KinematicsError, TrajectoryError: the arm or the motion cannot be built; the message says where.
     """
     name = _variant(scenario, variant)
-    return next(_simulate(scenario, name, [scenario.variants[name]], threads=1))
+    return next(_simulate([scenario], name, threads=1))
 
 
 def run_all(scenario: Scenario) -> dict[str, RunLog]:
@@ -91,11 +91,8 @@ def run_batch(
     """
     name = _variant(scenario, variant)
     for start in range(0, len(members), CHUNK):
-        chunk = [
-            Scenario.parse(scenario.text, source=scenario.source, folder=scenario.folder, overrides=member).variants[name]
-            for member in members[start : start + CHUNK]
-        ]
-        yield from _simulate(scenario, name, chunk, threads)
+        chunk = [scenario.changed(member, name) for member in members[start : start + CHUNK]]
+        yield from _simulate(chunk, name, threads)
 
 
 def _variant(scenario: Scenario, variant: str | None) -> str:
@@ -122,7 +119,9 @@ class _Arm:
         return 3 if self.n < 6 else 6
 
 
-def _simulate(scenario: Scenario, variant: str, members: Sequence[Settings], threads: int) -> Iterator[RunLog]:
+def _simulate(scenarios: Sequence[Scenario], variant: str, threads: int) -> Iterator[RunLog]:
+    scenario = scenarios[0]
+    members = [one.variants[variant] for one in scenarios]
     first = members[0]
     for k, member in enumerate(members):
         for block in ("arm", "loop"):
@@ -140,8 +139,8 @@ def _simulate(scenario: Scenario, variant: str, members: Sequence[Settings], thr
     with about("plant.timestep"):
         timestep = _timestep(first)
     with about("arm"):
-        shared = all(member.plant == first.plant for member in members)
-        models = [_plant_model(member, scenario.folder) for member in (members[:1] if shared else members)]
+        models = [_plant_model(member, scenario.folder) for member in members]
+        shared = all(model is models[0] for model in models)
         kinematics = kinematics_for(chain_of(models[0]))
         arm = _Arm(kinematics, home(models[0]), torque_limits(models[0]))
     with about("initial.q"):
@@ -172,7 +171,7 @@ def _simulate(scenario: Scenario, variant: str, members: Sequence[Settings], thr
             kinematics=kinematics,
             trajectory=trajectories[k % len(trajectories)],
             tau_max=arm.tau_max,
-            scenario=scenario.resolved(variant),
+            scenario=scenarios[k].resolved(variant),
             versions=versions(),
         )
         for k, seed in enumerate(seeds)

@@ -1,7 +1,7 @@
 """A scenario file: its text, its variants, and where in it every key stands."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from lwa4d_sim.documents import dotted, merge, one_line, plain, put, short
 from lwa4d_sim.errors import LwaError, ScenarioError
 from lwa4d_sim.expect import check_expectations
 from lwa4d_sim.schema import Misfit, fit, unknown_key
-from lwa4d_sim.settings import Settings
+from lwa4d_sim.settings import CHOICES, Settings
 from lwa4d_sim.yaml_text import parse
 
 DEFAULT_VARIANT = "default"  # the one variant of a scenario that names none
@@ -78,15 +78,12 @@ class Scenario:
     ) -> "Scenario":
         """A scenario from its text; see `load`."""
         document, lines = parse(text, source)
-        if not isinstance(document, Mapping):
+        if not isinstance(document, dict):
             raise ScenarioError(f"{source}: must be a mapping with the keys {', '.join(_TOP_KEYS)}")
-        overrides = {key: plain(value, one_line(f"{source}: {key}")) for key, value in (overrides or {}).items()}
-        for key, value in overrides.items():
-            try:
-                document = put(document, key, value)
-            except ScenarioError as error:
-                raise ScenarioError(one_line(f"{source}: {error}")) from None
-        made = Scenario(
+        for key, kind in CHOICES.items():  # so that an override of another kind is seen to be one
+            if isinstance(document.get(key), Mapping):
+                document[key] = {"kind": kind, **document[key]}
+        bare = Scenario(
             name=str(document.get("name", "")),
             source=source,
             folder=folder or Path(),
@@ -95,12 +92,33 @@ class Scenario:
             expect={},
             document=document,
             _lines=lines,
-            overrides=overrides,
         )
+        made = bare._overridden(overrides or {})
         made._check_top()
         variants = {name: made._settings(name) for name in made._variant_names()}
         expect = made._expectations(variants)
-        return Scenario(**{**made.__dict__, "variants": variants, "expect": expect})
+        return replace(made, variants=variants, expect=expect)
+
+    def changed(self, overrides: Mapping[str, Any], variant: str) -> "Scenario":
+        """One variant of this scenario with further overrides; the file is not read again.
+
+        Raises:
+            ScenarioError: an override does not fit.
+        """
+        made = self._overridden(overrides)
+        return replace(made, variants={variant: made._settings(variant)})
+
+    def _overridden(self, overrides: Mapping[str, Any]) -> "Scenario":
+        """The same with more overrides in its document; nothing else is looked at."""
+        values = {key: plain(value, one_line(f"{self.source}: {key}")) for key, value in overrides.items()}
+        document = self.document
+        for key, value in values.items():
+            try:
+                document = put(document, key, value)
+            except ScenarioError as error:
+                raise ScenarioError(one_line(f"{self.source}: {error}")) from None
+        name = str(document.get("name", ""))
+        return replace(self, name=name, document=document, overrides={**self.overrides, **values})
 
     def error(self, path: KeyPath, rule: str, variant: str | None = None) -> ScenarioError:
         """An error at a key: file, line, key, value, rule."""

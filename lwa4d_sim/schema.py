@@ -17,6 +17,10 @@ from lwa4d_sim.controllers import CustomController
 from lwa4d_sim.documents import Path
 from lwa4d_sim.settings import CHOICES, Settings
 
+# Beyond this a number in SI units (three years, a hundred thousand tons) is a mistake, and its square may overflow;
+# below the other a time constant is. Assumed.
+_LARGEST, _SMALLEST = 1e8, 1e-12
+
 
 class Misfit(Exception):
     """A key that does not fit the schema.
@@ -76,6 +80,10 @@ def _bare(member: Any) -> Any:
     return typing.get_args(member)[0] if typing.get_origin(member) is typing.Annotated else member
 
 
+def _rules(member: Any) -> tuple[Any, ...]:
+    return typing.get_args(member)[1:] if typing.get_origin(member) is typing.Annotated else ()
+
+
 def _items(members: Sequence[Any], i: int) -> list[Any]:
     """What the item ``i`` of a list may be."""
     tuples = [typing.get_args(_bare(m)) for m in members if typing.get_origin(_bare(m)) is tuple]
@@ -97,6 +105,11 @@ class _Reading:
             return self._resolve_mapping(classes, dict(node), path) if classes else node
         if isinstance(node, list):
             return [self.resolve(_items(members, i), value, (*path, i)) for i, value in enumerate(node)]
+        if isinstance(node, (int, float)) and float in map(_bare, members):
+            if abs(node) > _LARGEST:
+                raise Misfit(path, f"must lie within {-_LARGEST:g} and {_LARGEST:g}")
+            if 0 < node < _SMALLEST and any(isinstance(rule, Gt) for member in members for rule in _rules(member)):
+                raise Misfit(path, f"must be at least {_SMALLEST:g}")
         return node
 
     def _resolve_mapping(self, classes: list[Any], node: dict[str, Any], path: Path) -> Any:
@@ -186,7 +199,7 @@ def _wanted(members: Sequence[Any]) -> str:
 
 
 def _phrase(member: Any, plural: bool = False) -> str:
-    bare, rules = _bare(member), typing.get_args(member)[1:] if _bare(member) is not member else ()
+    bare, rules = _bare(member), _rules(member)
     if bare in _NOUNS:
         bounds = " and ".join(filter(None, map(_bound, rules)))
         return f"{_NOUNS[bare][plural]} {bounds}".strip()

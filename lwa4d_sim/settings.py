@@ -5,7 +5,7 @@ The parameter classes are the schema; `scenario` fills them from YAML and `runne
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Lt
 
@@ -13,7 +13,7 @@ from lwa4d_sim.channels import Latency, Loss, Transport
 from lwa4d_sim.controllers import ControllerParameters
 from lwa4d_sim.drives import LateData
 from lwa4d_sim.estimators import FilteredDerivative, VelocityParameters
-from lwa4d_sim.interfaces import Annotated, NonNegative, Positive
+from lwa4d_sim.interfaces import NonNegative, Positive
 from lwa4d_sim.mjcf import ArmEdits
 from lwa4d_sim.plant import Disturbance
 from lwa4d_sim.trajectories import FourierMotion, SampledMotion, WaypointMotion
@@ -50,7 +50,7 @@ class PlantSettings(ArmEdits):
     timestep: Positive = 0.001
     integrator: Literal["RK4", "Euler", "implicit", "implicitfast"] = "RK4"
     disturbances: tuple[Disturbance, ...] = ()
-    seed: Annotated[int, Ge(0)] = 0
+    seed: Annotated[int, Ge(0), Lt(2**63)] = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +118,7 @@ class SampledLoop:
     phase: NonNegative | None = None
     position_resolution: NonNegative | tuple[NonNegative, ...] = 0.0
     torque_resolution: NonNegative | tuple[NonNegative, ...] = 0.0
-    late_data: LateData = LateData()
+    late_data: LateData = field(default_factory=LateData)
 
     @property
     def transports(self) -> tuple[Transport, Transport]:
@@ -172,4 +172,3 @@ class Settings:
 
 #: Blocks that a scenario chooses by `kind`: the classes, and the kind that may be left out.
 CHOICES: Mapping[str, str] = {"trajectory": "waypoints", "loop": "sampled"}
-

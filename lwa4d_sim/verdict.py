@@ -103,15 +103,15 @@ def remarks(runs: Mapping[str, Run]) -> list[str]:
     ends = [(name, _largest(run.metrics.get("final_error"))) for name, run in runs.items()]
     listed = _listed([(name, _length(end)) for name, end in ends if end is not None])
     if listed:
-        out.append(f"At the end of a segment the tool is at most so far from where it should be: {listed}.")
+        out.append(f"Largest distance of the tool from its goal at the end of a segment: {listed}.")
     apart = [(name, _largest(_calm_part(run))) for name, run in runs.items()]
     listed = _listed([(name, _length(distance)) for name, distance in apart if distance is not None])
     if listed:
-        out.append(f"While it does not shake, the tool keeps this close to the path of the ideal run: {listed}.")
+        out.append(f"Largest distance of the tool from the ideal run before anything shakes: {listed}.")
     stuck = [(name, run.metrics.get("saturation_fraction") or 0) for name, run in runs.items()]
     listed = _listed([(name, f"{100 * share:.2g} %") for name, share in stuck if share > 0])
     if listed:
-        out.append(f"Motors are at their torque limit for this share of the time: {listed}.")
+        out.append(f"Share of the time that the motors spend at their torque limits: {listed}.")
     return out
 
 

@@ -29,8 +29,8 @@ def build_beliefs(rows: Sequence[Belief], arm: str, base: Path | None, threads: 
         ModelError: an edit does not fit the arm, or the closed form does not describe it.
         ScenarioError: closed-form controllers of one batch believe different things.
     """
-    shared = all(row == rows[0] for row in rows)
-    models = [load_model(arm, row, base=base) for row in (rows[:1] if shared else rows)]
+    models = [load_model(arm, row, base=base) for row in rows]
+    shared = all(model is models[0] for model in models)
     if rows[0].dynamics == "mujoco":
         return NominalModel(models[0] if shared else models, len(rows), threads)
     if not shared:

@@ -5,9 +5,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
+import numpy as np
+
 from lwa4d_sim.controllers.belief import Belief
 from lwa4d_sim.errors import ScenarioError
-from lwa4d_sim.interfaces import Controller
+from lwa4d_sim.interfaces import Array, ArmModel, Controller, JointState
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,10 +35,25 @@ class CustomController:
         Raises:
             ScenarioError: no such module or class, wrong options, or no `torque` method.
         """
-        made: Controller = load_object(self.kind, "controller.kind", self.options)
-        if not callable(getattr(made, "torque", None)):
-            raise ScenarioError(f"controller.kind: {self.kind} has no method torque(state, ref, model)")
-        return made
+        law = load_object(self.kind, "controller.kind", self.options)
+        if not callable(getattr(law, "torque", None)):
+            raise ScenarioError(f"{self.kind} has no method torque(state, ref, model)", key="controller.kind")
+        return _Checked(self.kind, law)
+
+
+@dataclass(frozen=True, slots=True)
+class _Checked:
+    """A user's law with its answers checked and copied, for it may well return the same array every time."""
+
+    kind: str
+    law: Controller
+
+    def torque(self, state: JointState, ref: Any, model: ArmModel) -> Array:
+        tau = np.array(self.law.torque(state, ref, model), float)
+        if tau.shape != state.q.shape:
+            rule = f"must be {state.q.shape}: a row for each simulation, a column for each joint"
+            raise ScenarioError(f"torque() of {self.kind} returned shape {tau.shape}; {rule}", key="controller.kind")
+        return tau
 
 
 def load_object(kind: str, key: str, options: Mapping[str, Any]) -> Any:
