@@ -21,12 +21,13 @@ _BLOCK = 256  # draws taken from a generator at a time; fixed, so that a run's b
 
 @dataclass(frozen=True, kw_only=True)
 class UniformLatency:
-    """Latency drawn evenly between ``low`` and ``high`` [s]."""
+    """Latency drawn evenly between ``low`` and ``high`` [s], in whole multiples of ``step`` where that is given."""
 
     __pydantic_config__: ClassVar[Any] = _STRICT
     kind: Literal["uniform"] = "uniform"
     low: NonNegative = 0.0
     high: NonNegative
+    step: NonNegative = 0.0
 
     def __post_init__(self) -> None:
         """Check the order of the bounds (ValueError)."""
@@ -35,7 +36,8 @@ class UniformLatency:
 
     def draw(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
         """Latencies [s] of the given shape."""
-        return rng.uniform(self.low, self.high, shape)
+        seconds = rng.uniform(self.low, self.high, shape)
+        return np.rint(seconds / self.step) * self.step if self.step else seconds
 
     @property
     def usual_longest(self) -> float:

@@ -1,5 +1,6 @@
 """Expectations of a scenario: which metrics must hold, within which bounds."""
 
+import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 from lwa4d_sim.metrics import METRICS
 
 _FLAGS = ("stable",)
+_SIDES = ("max", "min")
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,8 +27,13 @@ def check_expectations(key: str, bound: Any) -> str | None:
         return None if isinstance(bound, bool) else "must be true or false"
     metric = _metric(key)
     if metric is None:
-        numeric = ", ".join(name for name in METRICS if name not in _FLAGS)
-        return f"unknown expectation; valid: stable, or one of these followed by _max or _min: {numeric}"
+        numeric = [name for name in METRICS if name not in _FLAGS]
+        close = difflib.get_close_matches(
+            key, [*_FLAGS, *(f"{name}_{side}" for name in numeric for side in _SIDES)], n=1
+        )
+        hint = f"did you mean '{close[0]}'? " if close else ""
+        rest = f"one of these followed by _max or _min: {', '.join(numeric)}"
+        return f"unknown expectation; {hint}valid here: {', '.join(_FLAGS)}, or {rest}"
     bounds = bound if isinstance(bound, list) else [bound]
     if not bounds or not all(b is None or (isinstance(b, (int, float)) and not isinstance(b, bool)) for b in bounds):
         return "must be a number, or a list of numbers (null skips an entry)"
@@ -48,7 +55,7 @@ def evaluate(rules: Mapping[str, Any], values: Mapping[str, Any]) -> list[Outcom
 
 def _metric(key: str) -> str | None:
     name, _, side = key.rpartition("_")
-    return name if side in ("max", "min") and name in METRICS and name not in _FLAGS else None
+    return name if side in _SIDES and name in METRICS and name not in _FLAGS else None
 
 
 def _within(value: Any, bound: Any, upper: bool) -> bool:

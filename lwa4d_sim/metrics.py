@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 SMOOTH_WINDOW = 0.4  # [s] motion that a cubic over this window follows is motion, the rest is vibration
 VIBRATION_FLOOR = 0.02  # [rad/s] rms below which nobody would see or hear it
 VIBRATION_LIMIT = 0.4  # [rad/s] rms that is unstable in any case: the rated speed of the slow joints
+RUNAWAY = 3.0  # [rad/s] more than twice the rated speed of the fastest joint
 DECAY = 0.9  # a vibration that keeps more than this from one window to the next does not decay
 _COARSE = 5_000_000  # [ns] 100 Hz is beyond any arm's motion
 SETTLED = 0.02  # of the segment's distance: the usual 2 % band
@@ -48,23 +49,23 @@ def metrics(log: "RunLog") -> dict[str, Any]:
     """
     vibration, since = vibrations(log)
     x, x_ref = log.x, log.x_ref
-    # where the tool should be at the end of each segment it has reached: the sample before the knot, for a step
-    # reference jumps at the knot itself
-    goals = [x_ref[max(0, end - 1)].copy() if end < len(x) else None for _, end in _segments(log)]
+    goals = [_left_limit(x_ref, end) if end < len(x) else None for _, end in _segments(log)]
     x_ref -= x  # in place: the paths are a tenth of a long record each
     error = np.sqrt(np.einsum("ij,ij->i", x_ref, x_ref))
     del x_ref
     ticks = log.ticks
     joint_error = ticks.q_ref - ticks.q_true
     known = ~np.isnan(ticks.dq).any(axis=1)
-    tail = log.tau[-min(len(log.tau), round(NS_PER_S / log.timestep)) :]
+    tail = log.tau[-min(len(log.tau), round(NS_PER_S / log.timestep) + 1) :]
     diverged = log.diverged_at
     values: dict[str, Any] = {
         "stable": diverged is None and since is None,
         "unstable_since": since if since is not None else diverged,
         "diverged_at": diverged,
-        # both at the sample before the knot, so that perfect tracking of a moving end has no error
-        "final_error": [float(error[max(0, end - 1)]) if end < len(x) else None for _, end in _segments(log)],
+        "final_error": [
+            None if goal is None else float(np.linalg.norm(x[end] - goal))
+            for goal, (_, end) in zip(goals, _segments(log), strict=True)
+        ],
         "max_error": float(error.max()),
         "rms_error": _rms(error),
         "settling_time": _settling(log, x, goals),
@@ -109,6 +110,12 @@ def _segments(log: "RunLog") -> list[tuple[int, int]]:
     return list(zip([0, *ends[:-1]], ends, strict=True))
 
 
+def _left_limit(x_ref: Array, end: int) -> Array:
+    """The reference just before sample ``end``: a step reference jumps at the knot itself, a moving one goes on."""
+    last = x_ref[max(0, end - 1)]
+    return 2.0 * last - x_ref[end - 2] if end > 1 else last.copy()
+
+
 def _settling(log: "RunLog", x: Array, goals: list[Array | None]) -> list[float | None]:
     """Per segment, the time from its start after which the tool stays in the band around the segment's end point."""
     out: list[float | None] = []
@@ -136,20 +143,23 @@ def vibrations(log: "RunLog") -> tuple[list[float | None], float | None]:
     Vibration is what a cubic fitted over `SMOOTH_WINDOW` (Savitzky and Golay 1964) leaves of the joint speed; a segment
     of less than a second has none that could be told from motion. A segment is unstable when, in its last second (or
     quarter), the vibration is above the floor and has not decayed against the stretch before, or is above the limit
-    anyway. The onset is the start of the stretch in which the running rms stays above the floor.
+    anyway. The onset is the start of the stretch in which the running rms stays above the floor; where a run diverges,
+    of the stretch in which some joint is too fast for any drive.
     """
     # half a control period resolves every frequency a sampled loop can have; the ideal loop has none of its own
     finest = log.period // 2 if log.period > log.timestep else _COARSE
     stride = max(1, min(finest, _COARSE) // log.timestep)
     h = stride * log.timestep / NS_PER_S
     half = max(2, round(0.5 * SMOOTH_WINDOW / h))
-    signal = _detrended(log.dq[::stride], half)
+    signal = vibrating(log.dq[::stride], half)
     power = (signal**2).max(axis=1)
     values: list[float | None] = []
     since: float | None = None
     for start, end in _segments(log):
         if end >= len(log.dq):
             values.append(None)
+            if since is None and log.diverged_at is not None and start < len(log.dq):
+                since = _runaway(log, start)
             continue
         # the fit looks half a window ahead and must not see the next segment's jump
         a, b = start // stride, end // stride - half
@@ -167,6 +177,12 @@ def vibrations(log: "RunLog") -> tuple[list[float | None], float | None]:
     return values, since
 
 
+def _runaway(log: "RunLog", start: int) -> float:
+    """Instant [s] from which, to its end, a diverged run has a joint faster than `RUNAWAY`."""
+    slow = np.flatnonzero(np.abs(log.dq[start:]).max(axis=1) < RUNAWAY)
+    return (start + (int(slow[-1]) + 1 if slow.size else 0)) * log.timestep / NS_PER_S
+
+
 def _onset(power: Array, window: int, h: float) -> int:
     """First index after which the running mean of ``power`` stays above the floor to the end of the segment."""
     width = max(1, min(round(0.2 / h), window))
@@ -175,7 +191,7 @@ def _onset(power: Array, window: int, h: float) -> int:
     return int(below[-1]) + 1 if below.size else 0
 
 
-def _detrended(signal: Array, half: int) -> Array:
+def vibrating(signal: Array, half: int) -> Array:
     """``signal`` (T, n) minus its cubic fit over 2 half + 1 samples; beyond the ends the end values go on."""
     if len(signal) <= 2 * half:
         return np.asarray(signal - signal.mean(axis=0))

@@ -158,7 +158,7 @@ class _Reading:
 
 def unknown_key(key: str, valid: Mapping[str, Any] | Sequence[str]) -> str:
     """The rule that an unknown key breaks."""
-    close = difflib.get_close_matches(key, valid, n=1)
+    close = difflib.get_close_matches(key.lower(), valid, n=1)
     hint = f"did you mean '{close[0]}'? " if close else ""
     return f"unknown key; {hint}valid here: {', '.join(valid)}"
 

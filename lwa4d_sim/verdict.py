@@ -132,6 +132,8 @@ def _largest(values: Any) -> float | None:
 
 
 def _length(metres: float) -> str:
+    if metres < 1e-6:
+        return "less than 0.001 mm"
     return f"{1e3 * metres:.3g} mm" if metres < 1 else f"{metres:.3g} m"
 
 

@@ -178,14 +178,15 @@ def test_settling_counts_from_each_segments_start_and_is_none_when_it_never_sett
 
 
 def test_errors_of_a_known_offset() -> None:
-    """Reference steps at the knots; the arm stands 3-4-0 away in the first half, right on it in the second."""
+    """A reference that steps at the knot is compared with where the arm is then: 3-4-0 away, and right on it later."""
     x_ref = along(np.where(np.arange(2001) < 1000, 1.0, 2.0))
-    x = x_ref.copy()
-    x[:1000] += [0.03, 0.04, 0.0]
+    x = along(np.where(np.arange(2001) <= 1000, 1.0, 2.0))
+    x[:1001] += [0.03, 0.04, 0.0]
     values = metrics(made_log(x=x, x_ref=x_ref, knots=(1.0, 2.0)))
+    step = math.hypot(0.97, 0.04)
     assert values["final_error"] == pytest.approx([0.05, 0.0])
-    assert values["max_error"] == pytest.approx(0.05)
-    assert values["rms_error"] == pytest.approx(0.05 * math.sqrt(1000 / 2001))
+    assert values["max_error"] == pytest.approx(step)
+    assert values["rms_error"] == pytest.approx(math.sqrt((1000 * 0.05**2 + step**2) / 2001))
 
 
 def test_perfect_tracking_of_a_moving_end_has_no_final_error() -> None:

@@ -319,6 +319,7 @@ def test_remarks_tell_accuracy_cost_and_saturation() -> None:
         "Share of the time that the motors spend at their torque limits: 25 % (can).",
     ]
     assert remarks({"default": _run(final_error=[None])}) == []
+    assert "segment: less than 0.001 mm (x)." in remarks({"x": _run(final_error=[6e-8])})[0]
 
 
 def test_a_diverged_run_has_a_section_without_numbers_that_do_not_exist(tmp_path: Path) -> None:

@@ -72,7 +72,7 @@ def test_scalars_are_those_of_yaml_1_2(text: str, value: Any) -> None:
     ("text", "line", "words"),
     [
         ("a:\tb\n\tc: d", 2, "tab"),
-        ("a: 1\nb: [1,\n", 3, "flow sequence"),
+        ("a: 1\nb: [1,\n", 3, "flow node"),
         ("a: 1\na: 2", 2, "the key 'a' is given twice"),
         ("a:\n  b: 1\n  b: 2", 3, "the key 'b' is given twice"),
         ("a: 1\n2: 3", 2, "the key '2' must be plain text"),
