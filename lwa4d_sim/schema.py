@@ -173,6 +173,8 @@ def _choose(classes: list[Any], node: dict[str, Any], path: Path) -> Any:
     kinds = _kinds(classes)
     if "kind" not in node:
         raise Misfit((*path, "kind"), f"is missing; give one of {', '.join(kinds)}")
+    if node["kind"] is True and "true" in kinds:  # what YAML makes of `kind: true`
+        node["kind"] = "true"
     kind = node["kind"]
     if not isinstance(kind, str) or (kind not in kinds and not (_OWN in kinds and ":" in kind)):
         raise Misfit((*path, "kind"), f"must be one of {', '.join(kinds)}")
