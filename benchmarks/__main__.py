@@ -146,7 +146,9 @@ BENCHMARKS: dict[str, tuple[Callable[[], tuple[float, float]], str, float]] = {
 def main() -> None:
     names = sys.argv[1:] or list(BENCHMARKS)
     print(f"MuJoCo {mujoco.__version__}, {default_workers()} processors\n")
-    print(f"| {'what':52} | {'limit':>6} | {'found':>6} | {'base [s]':>8} |\n|{'-' * 54}|{'-' * 8}|{'-' * 8}|{'-' * 10}|")
+    print(
+        f"| {'what':52} | {'limit':>6} | {'found':>6} | {'base [s]':>8} |\n|{'-' * 54}|{'-' * 8}|{'-' * 8}|{'-' * 10}|"
+    )
     for name in names:
         function, what, limit = BENCHMARKS[name]
         found, base = function()

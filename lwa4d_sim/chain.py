@@ -143,7 +143,8 @@ class SerialKinematics:
         self.chain = chain
         self.n = len(chain.names)
         self.lower, self.upper = np.asarray(chain.lower, float), np.asarray(chain.upper, float)
-        F, c, rotations, offsets = np.eye(3), np.zeros(3), [], []
+        F: Array = np.eye(3)
+        c, rotations, offsets = np.zeros(3), [], []
         for i in range(self.n):
             F_next = _frame_about(chain.axis[i])
             offsets.append(F.T @ (chain.pos[i] + chain.R[i] @ chain.anchor[i] - c))

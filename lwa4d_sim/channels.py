@@ -7,15 +7,14 @@ never a zero.
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from annotated_types import Ge, Lt, MinLen
 
 from lwa4d_sim.errors import ScenarioError
-from lwa4d_sim.interfaces import NS_PER_S, Annotated, Array, Arrived, Channel, IntArray, NonNegative, Ns, to_ns
+from lwa4d_sim.interfaces import NS_PER_S, STRICT, Array, Arrived, Channel, IntArray, NonNegative, Ns, to_ns
 
-_STRICT: Any = {"extra": "forbid", "allow_inf_nan": False}
 _BLOCK = 256  # draws taken from a generator at a time; fixed, so that a run's bits do not depend on its length
 
 
@@ -23,7 +22,7 @@ _BLOCK = 256  # draws taken from a generator at a time; fixed, so that a run's b
 class UniformLatency:
     """Latency drawn evenly between ``low`` and ``high`` [s], in whole multiples of ``step`` where that is given."""
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     kind: Literal["uniform"] = "uniform"
     low: NonNegative = 0.0
     high: NonNegative
@@ -49,7 +48,7 @@ class UniformLatency:
 class NormalLatency:
     """Latency drawn from a normal law, cut off at zero [s]."""
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     kind: Literal["normal"] = "normal"
     mean: NonNegative
     std: NonNegative
@@ -68,7 +67,7 @@ class NormalLatency:
 class ExponentialLatency:
     """A fixed latency plus an exponential tail of the given mean [s]."""
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     kind: Literal["exponential"] = "exponential"
     minimum: NonNegative = 0.0
     tail: NonNegative
@@ -87,7 +86,7 @@ class ExponentialLatency:
 class TraceLatency:
     """Measured latencies replayed in order [s], from the start again when they run out; all joints alike."""
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     kind: Literal["trace"] = "trace"
     values: Annotated[tuple[NonNegative, ...], MinLen(1)]
 
@@ -111,7 +110,7 @@ class Loss:
         mean_burst: mean number of samples lost in a row; 1 / (1 - probability) is independent loss, the default.
     """
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     probability: Annotated[float, Ge(0), Lt(1)] = 0.0
     mean_burst: Annotated[float, Ge(1)] | None = None
 
@@ -177,7 +176,7 @@ class RandomChannel:
             self._newest = Arrived(never, never, tuple(np.full(shape, np.nan) for _ in values))
 
     def newest(self, now: Ns) -> Arrived | None:
-        waiting = deque()
+        waiting: deque[tuple[IntArray, Ns, tuple[Array, ...]]] = deque()
         for arrival, stamp, values in self._queue:
             here = arrival <= now
             if here.any():
@@ -232,7 +231,7 @@ class LatencyDraws:
         self._shape = (_BLOCK, n if transport.per_joint else 1)
         self._generators = [np.random.default_rng(seed) for seed in seeds]
         self._index = 0
-        self._block: IntArray = np.empty((0,))
+        self._block: IntArray = np.empty((0,), np.int64)
 
     def next(self) -> IntArray:
         """Latency of the next sample, (N, n) or broadcastable to it."""
@@ -240,7 +239,8 @@ class LatencyDraws:
         if k == 0:
             self._block = np.stack([self._draw(rng) for rng in self._generators], axis=1)
         self._index += 1
-        return self._block[k]
+        latency: IntArray = self._block[k]
+        return latency
 
     def _draw(self, rng: np.random.Generator) -> IntArray:
         if isinstance(self._latency, TraceLatency):
@@ -252,7 +252,8 @@ class LatencyDraws:
             seconds = self._latency.draw(rng, self._shape)
         if self._jitter:
             seconds = seconds + rng.uniform(0.0, self._jitter, self._shape)
-        return np.rint(seconds * NS_PER_S).astype(np.int64)
+        drawn: IntArray = np.rint(seconds * NS_PER_S).astype(np.int64)
+        return drawn
 
 
 class LossDraws:
@@ -319,4 +320,3 @@ class Transport:
         laws, losses = ([np.random.SeedSequence(seed, spawn_key=(signal, k)) for seed in seeds] for k in (0, 1))
         draws = LossDraws(self, losses, n) if self.loss.probability else None
         return RandomChannel(LatencyDraws(self, laws, n), draws, gate)
-

@@ -1,13 +1,11 @@
-"""The drive's side of the link, but for the bus: encoder, torque resolution and limit, and what it does with late data."""
+"""The drive but for its bus: encoder, torque resolution and limit, and what it does with late data."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from lwa4d_sim.interfaces import NS_PER_S, Array, Arrived, Ns, Positive, to_ns
-
-_STRICT: Any = {"extra": "forbid", "allow_inf_nan": False}
+from lwa4d_sim.interfaces import NS_PER_S, STRICT, Array, Arrived, Ns, Positive, to_ns
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +19,7 @@ class LateData:
         ramp_time: length of the ramp [s].
     """
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     policy: Literal["hold", "zero", "ramp", "stop"] = "hold"
     timeout: Positive | None = None
     ramp_time: Positive = 0.1
@@ -96,5 +94,3 @@ def _round(x: Array, step: Array) -> Array:
     """``x`` to the nearest multiple of ``step``; a step of 0 leaves it as it is."""
     coarse: Array = np.where(step > 0, np.rint(x / np.where(step > 0, step, 1.0)) * step, x)
     return coarse
-
-

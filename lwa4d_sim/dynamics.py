@@ -11,9 +11,9 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from lwa4d_sim.chain import bias_from_jacobian, jacobian_from_axes
 from lwa4d_sim.errors import ModelError
 from lwa4d_sim.interfaces import Array, Pose
-from lwa4d_sim.chain import bias_from_jacobian, jacobian_from_axes
 
 _VELOCITY_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
@@ -44,7 +44,7 @@ class NominalModel:
         self._dense = np.asarray(first.M_rowadr)[high] + low
 
     def at(self, q: Array, dq: Array | None = None) -> "NominalModel":
-        """Evaluate at ``q`` and ``dq`` (N, n) [rad, rad/s]; without ``dq`` at rest, so that ``h`` is the gravity torque."""
+        """Evaluate at ``q`` and ``dq`` (N, n) [rad, rad/s]; without ``dq`` at rest, where ``h`` is gravity."""
         self._q[:] = q
         self._dq[:] = 0.0 if dq is None else dq
         self._batch.forward(stage=_VELOCITY_STAGE)
@@ -62,12 +62,14 @@ class NominalModel:
     def M(self) -> Array:
         """Inertia matrix (N, n, n) [kg m^2], rotor inertia included."""
         # take, not an index: its layout, and with it every product's last bit, is the same for any N
-        return self._field("M").take(self._dense, axis=1)
+        M: Array = self._field("M").take(self._dense, axis=1)
+        return M
 
     @property
     def h(self) -> Array:
         """Bias torque (N, n) [N m]: C dq + g."""
-        return self._h.copy()
+        h: Array = self._h.copy()
+        return h
 
     @property
     def pose(self) -> Pose:

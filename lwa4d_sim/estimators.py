@@ -10,9 +10,7 @@ from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 
-from lwa4d_sim.interfaces import NS_PER_S, Array, Estimator, JointState, Measurement, Ns, Positive
-
-_STRICT: Any = {"extra": "forbid", "allow_inf_nan": False}
+from lwa4d_sim.interfaces import NS_PER_S, STRICT, Array, Estimator, JointState, Measurement, Ns, Positive
 
 
 class VelocitySource(Protocol):
@@ -189,7 +187,7 @@ class Kalman:
 class TrueVelocity:
     """The plant's own speed, latched with the position."""
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     kind: Literal["true"] = "true"
 
     def build(self, q0: Array, period: float, timestep: float) -> tuple[VelocitySource | None, Estimator]:
@@ -206,7 +204,7 @@ class FilteredDerivative:
         runs_on: continuous = in the drive, before the sampler; held = in the controller, on the received staircase.
     """
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     kind: Literal["filtered_derivative"] = "filtered_derivative"
     time_constant: Positive = 0.01
     runs_on: Literal["continuous", "held"] = "continuous"
@@ -222,7 +220,7 @@ class FilteredDerivative:
 class BackwardDifferenceVelocity:
     """Difference of the last two samples over their age."""
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     kind: Literal["backward_difference"] = "backward_difference"
 
     def build(self, q0: Array, period: float, timestep: float) -> tuple[VelocitySource | None, Estimator]:
@@ -238,7 +236,7 @@ class TustinVelocity:
         time_constant: T [s].
     """
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     kind: Literal["tustin"] = "tustin"
     time_constant: Positive = 0.01
 
@@ -256,7 +254,7 @@ class KalmanVelocity:
         position: standard deviation of a position sample [rad].
     """
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     kind: Literal["kalman"] = "kalman"
     acceleration: Positive = 10.0
     position: Positive = 1.75e-5  # one millidegree, the bus's resolution

@@ -11,7 +11,7 @@ import numpy as np
 from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]  # float64 throughout; numpy types many results this wide
 IntArray = NDArray[np.int64]
 Ns = NewType("Ns", int)  # simulated time [ns]
 
@@ -19,6 +19,9 @@ Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
 
 NS_PER_S = 1_000_000_000
+
+# How the scenario reader treats every parameter class: unknown keys, NaN and infinity are errors.
+STRICT: Any = {"extra": "forbid", "allow_inf_nan": False}
 
 
 def to_ns(seconds: float) -> Ns:

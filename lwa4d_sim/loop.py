@@ -11,8 +11,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from lwa4d_sim.interfaces import (
-    Array,
     ArmModel,
+    Array,
     Arrived,
     Channel,
     Controller,

@@ -112,8 +112,10 @@ def _segments(log: "RunLog") -> list[tuple[int, int]]:
 
 def _left_limit(x_ref: Array, end: int) -> Array:
     """The reference just before sample ``end``: a step reference jumps at the knot itself, a moving one goes on."""
-    last = x_ref[max(0, end - 1)]
-    return 2.0 * last - x_ref[end - 2] if end > 1 else last.copy()
+    last: Array = x_ref[max(0, end - 1)].copy()
+    if end > 1:
+        last += last - x_ref[end - 2]
+    return last
 
 
 def _settling(log: "RunLog", x: Array, goals: list[Array | None]) -> list[float | None]:

@@ -12,7 +12,7 @@ from lwa4d_sim.arm import ARMS
 from lwa4d_sim.chain import Chain
 from lwa4d_sim.dynamics import tool_site
 from lwa4d_sim.errors import ModelError
-from lwa4d_sim.interfaces import Array, NonNegative, Positive
+from lwa4d_sim.interfaces import STRICT, Array, NonNegative, Positive
 from lwa4d_sim.mjcf_checks import check_arm, check_damping, name_of, require, torque_ranges
 
 _Vector = tuple[float, float, float]
@@ -38,7 +38,7 @@ class Payload:
         radius: of that sphere [m].
     """
 
-    __pydantic_config__: ClassVar[Any] = {"extra": "forbid", "allow_inf_nan": False}
+    __pydantic_config__: ClassVar[Any] = STRICT
     mass: NonNegative
     com: _Vector = (0.0, 0.0, 0.0)
     inertia: tuple[NonNegative, NonNegative, NonNegative] | None = None
@@ -54,7 +54,7 @@ class Friction:
         coulomb: [N m].
     """
 
-    __pydantic_config__: ClassVar[Any] = {"extra": "forbid", "allow_inf_nan": False}
+    __pydantic_config__: ClassVar[Any] = STRICT
     viscous: NonNegative | tuple[NonNegative, ...] = 0.0
     coulomb: NonNegative | tuple[NonNegative, ...] = 0.0
 
@@ -72,7 +72,7 @@ class ArmEdits:
         gravity: [m/s^2] in base axes.
     """
 
-    __pydantic_config__: ClassVar[Any] = {"extra": "forbid", "allow_inf_nan": False}
+    __pydantic_config__: ClassVar[Any] = STRICT
     payload: Payload | None = None
     mass_scale: Positive | tuple[Positive, ...] = 1.0
     armature: NonNegative | tuple[NonNegative, ...] | _Source | None = None

@@ -105,8 +105,9 @@ def check_damping(model: mujoco.MjModel, q: Array) -> None:
         int(mujoco.mjtIntegrator.mjINT_RK4): _RK4_LIMIT,
         int(mujoco.mjtIntegrator.mjINT_EULER): _EULER_LIMIT if explicit_euler else np.inf,
     }.get(model.opt.integrator, np.inf)  # the others, and Euler as a rule, treat damping implicitly
-    reach = np.where(model.jnt_limited[:, None], model.jnt_range, [-np.pi, np.pi])
-    poses = np.vstack([q, np.zeros_like(q), np.random.default_rng(0).uniform(*reach.T, (64, model.nv))])
+    reach: Array = np.where(model.jnt_limited[:, None], model.jnt_range, [-np.pi, np.pi])
+    drawn = np.random.default_rng(0).uniform(reach[:, 0], reach[:, 1], (64, model.nv))
+    poses = np.vstack([q, np.zeros_like(q), drawn])
     data = mujoco.MjData(model)
     M = np.empty((len(poses), model.nv, model.nv))
     for pose, inertia in zip(poses, M, strict=True):

@@ -10,7 +10,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from lwa4d_sim.errors import ModelError
-from lwa4d_sim.interfaces import Array, NonNegative, Positive, to_ns
+from lwa4d_sim.interfaces import STRICT, Array, NonNegative, Positive, to_ns
 
 # A joint this fast is no arm any more (assumed: about a thousand times the fastest joint of the LWA4D).
 SPEED_LIMIT = 1000.0  # [rad/s]
@@ -30,7 +30,7 @@ class Disturbance:
         body: name of the body in the model; default the tool.
     """
 
-    __pydantic_config__: ClassVar[Any] = {"extra": "forbid", "allow_inf_nan": False}
+    __pydantic_config__: ClassVar[Any] = STRICT
     at: NonNegative
     duration: Positive | None = None
     force: _Vector = (0.0, 0.0, 0.0)
@@ -104,7 +104,7 @@ class Plant:
         self._given_up = arms if self._given_up is None else self._given_up | arms
 
     def diverged(self) -> Any:
-        """Mask (N,) of arms found to have left all bounds since the last call, or None; they stand still from now on."""
+        """Mask (N,) of arms found to have left all bounds since the last call, or None; they stand still from then."""
         speed = np.abs(self.dq)
         if speed.max() < SPEED_LIMIT and self._given_up is None and not self._warnings.any():  # False for NaN
             return None
@@ -140,7 +140,7 @@ class Plant:
     def _mixed(self, tau: Array, q: Array, dq: Array) -> None:
         """Some arms braked or lost: runs of equal state, arm by arm groups."""
         steps = tau.shape[1]
-        braked = np.isnan(tau).any(axis=2)
+        braked: Any = np.isnan(tau).any(axis=2)
         start = 0
         changes = np.flatnonzero((braked[:, 1:] != braked[:, :-1]).any(axis=0)) + 1
         for end in [*changes.tolist(), steps]:

@@ -45,7 +45,7 @@ class _Seen:
 
     @property
     def count(self) -> int:
-        return self.q.shape[1]
+        return int(self.q.shape[1])
 
     def take(self, tick: Tick, k: int) -> None:
         if tick.state is None or tick.command is None or tick.age is None:
@@ -54,7 +54,7 @@ class _Seen:
         self.age[:, k] = tick.age.max(axis=1)
 
     def log(self, i: int, q: Array, dq: Array, t: Array, trajectory: Trajectory, *, exact: bool) -> TickLog:
-        """Of simulation ``i``, with the arm's own q and dq at the ticks; ``exact`` says the controller saw just those."""
+        """Of simulation ``i``, with the arm's own q and dq at the ticks; ``exact``: the controller saw just those."""
         kept = len(t)
         return TickLog(
             t=t,
@@ -127,7 +127,9 @@ def record(
                 q=q[i, :stop],
                 dq=dq[i, :stop],
                 tau=tau[i, :stop],
-                ticks=seen.log(i, q[i, at], dq[i, at], at * (timestep / NS_PER_S), info.trajectory, exact=not full_ticks),
+                ticks=seen.log(
+                    i, q[i, at], dq[i, at], at * (timestep / NS_PER_S), info.trajectory, exact=not full_ticks
+                ),
                 knots=info.trajectory.knots,
                 tau_max=info.tau_max,
                 seed=info.seed,
@@ -153,10 +155,9 @@ def _last_good(q: Array, dq: Array, end: int, total: int, timestep: Ns) -> tuple
 
 
 def _events(braked: Any, diverged: float | None, timestep: Ns) -> tuple[tuple[float, str], ...]:
-    events: list[tuple[float, str]] = []
     changes = np.flatnonzero(np.diff(np.concatenate([[False], braked]).astype(np.int8)))
-    for k in changes.tolist():
-        events.append((k * timestep / NS_PER_S, "brakes closed" if braked[k] else "brakes released"))
+    texts = {True: "brakes closed", False: "brakes released"}
+    events = [(k * timestep / NS_PER_S, texts[bool(braked[k])]) for k in changes.tolist()]
     if diverged is not None:
         events.append((diverged, "diverged"))
     return tuple(events)

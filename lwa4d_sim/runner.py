@@ -126,7 +126,9 @@ def _simulate(scenarios: Sequence[Scenario], variant: str, threads: int) -> Iter
     for k, member in enumerate(members):
         for block in ("arm", "loop"):
             if getattr(member, block) != getattr(first, block):
-                raise ScenarioError(f"{scenario.source}: member {k} of the batch differs in '{block}', all must share it")
+                raise ScenarioError(
+                    f"{scenario.source}: member {k} of the batch differs in '{block}'; all must share it"
+                )
 
     @contextmanager
     def about(key: str) -> Iterator[None]:
@@ -213,7 +215,8 @@ def _trajectories(members: Sequence[Settings], arm: _Arm, q0: Array, folder: Pat
     """One trajectory a member, or a single one that all share."""
     same = all(member.trajectory == members[0].trajectory for member in members) and (q0 == q0[0]).all()
     built: list[Trajectory] = [
-        member.trajectory.build(arm.kinematics, q0[k], folder) for k, member in enumerate(members[:1] if same else members)
+        member.trajectory.build(arm.kinematics, q0[k], folder)
+        for k, member in enumerate(members[:1] if same else members)
     ]
     if any(trajectory.duration != built[0].duration for trajectory in built):
         raise ScenarioError("all members of a batch must have the same duration")
@@ -257,7 +260,9 @@ def _controller(members: Sequence[Settings], arm: _Arm) -> Controller:
         if any(p != first for p in parameters):
             raise ScenarioError("all members of a batch must share a controller of your own")
         return first.create()
-    return type(first).build(parameters, arm.n, arm.task_size)
+    build: Any = type(first).build  # the parameters are all of this one type, which mypy cannot know
+    made: Controller = build(parameters, arm.n, arm.task_size)
+    return made
 
 
 def _loop(
@@ -269,9 +274,7 @@ def _loop(
     loop = settings.loop if isinstance(settings.loop, SampledLoop) else SampledLoop(period=dt)
     up, down = loop.transports
     sync = timing.period if loop.actuation == "next_sync" else 0
-    link = Link(
-        up.build(seeds, _MEASUREMENT, arm.n, Gate(1)), down.build(seeds, _COMMAND, arm.n, Gate(timestep, sync))
-    )
+    link = Link(up.build(seeds, _MEASUREMENT, arm.n, Gate(1)), down.build(seeds, _COMMAND, arm.n, Gate(timestep, sync)))
     drives = Drives(
         arm.tau_max,
         position_resolution=_resolution(loop.position_resolution, arm.n, "loop.position_resolution"),

@@ -13,12 +13,11 @@ from lwa4d_sim.channels import Latency, Loss, Transport
 from lwa4d_sim.controllers import ControllerParameters
 from lwa4d_sim.drives import LateData
 from lwa4d_sim.estimators import FilteredDerivative, VelocityParameters
-from lwa4d_sim.interfaces import NonNegative, Positive
+from lwa4d_sim.interfaces import STRICT, NonNegative, Positive
 from lwa4d_sim.mjcf import ArmEdits
 from lwa4d_sim.plant import Disturbance
 from lwa4d_sim.trajectories import FourierMotion, SampledMotion, WaypointMotion
 
-_STRICT: Any = {"extra": "forbid", "allow_inf_nan": False}
 _Share = Annotated[float, Ge(0), Lt(1)]
 
 TrajectoryParameters = WaypointMotion | FourierMotion | SampledMotion
@@ -32,7 +31,7 @@ class Initial:
         q: joint positions [rad]; default the model's `home`.
     """
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     q: tuple[float, ...] | None = None
 
 
@@ -57,7 +56,7 @@ class PlantSettings(ArmEdits):
 class Latencies:
     """Transport time of each direction [s]: a number, one number a joint, or a law."""
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     measurement: Latency = 0.0
     command: Latency = 0.0
 
@@ -66,7 +65,7 @@ class Latencies:
 class Jitters:
     """Width of the extra, evenly drawn transport time of each direction [s]."""
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     measurement: NonNegative = 0.0
     command: NonNegative = 0.0
 
@@ -75,7 +74,7 @@ class Jitters:
 class Losses:
     """Loss of each direction: a probability, or a Loss with bursts."""
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     measurement: _Share | Loss = 0.0
     command: _Share | Loss = 0.0
 
@@ -84,7 +83,7 @@ class Losses:
 class IdealLoop:
     """No bus: the controller acts at every plant step on the true state; second-order accurate in the plant step."""
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     kind: Literal["ideal"] = "ideal"
 
 
@@ -106,7 +105,7 @@ class SampledLoop:
         late_data: what the drive does when commands stay away.
     """
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     kind: Literal["sampled"] = "sampled"
     period: Positive = 0.01
     actuation: Literal["immediate", "next_sync"] = "immediate"
@@ -160,7 +159,7 @@ class Settings:
         loop: what lies between controller and arm.
     """
 
-    __pydantic_config__: ClassVar[Any] = _STRICT
+    __pydantic_config__: ClassVar[Any] = STRICT
     name: str
     arm: str
     initial: Initial = Initial()

@@ -12,13 +12,11 @@ import numpy as np
 from annotated_types import MinLen
 
 from lwa4d_sim.errors import KinematicsError, TrajectoryError
-from lwa4d_sim.interfaces import Array, Positive
+from lwa4d_sim.interfaces import STRICT, Array, Positive
 from lwa4d_sim.motion_files import read_samples
 from lwa4d_sim.motions import POSE_JOINTS, JointMotion, Kinematics, RedundantKinematics, TaskMotion, Turn
 from lwa4d_sim.polynomials import PiecewisePolynomial, boundary_polynomial
 from lwa4d_sim.rotations import from_rpy
-
-STRICT: Any = {"extra": "forbid", "allow_inf_nan": False}
 
 Row = Annotated[tuple[float, ...], MinLen(1)]
 Rows = Annotated[tuple[Row, ...], MinLen(1)]

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from lwa4d_sim.channels import UniformLatency
 from lwa4d_sim.controllers import ComputedTorque, CustomController, PdGravity
 from lwa4d_sim.errors import ModelError, ReachError, ScenarioError
+from lwa4d_sim.estimators import TrueVelocity
 from lwa4d_sim.metrics import METRICS
 from lwa4d_sim.scenario import Scenario
 from lwa4d_sim.schema import json_schema
@@ -182,6 +183,13 @@ def test_a_kind_that_was_left_out_still_tells_blocks_apart() -> None:
     variants = load(text).variants
     assert variants["ideal"].loop == IdealLoop()
     assert variants["late"].loop == SampledLoop(period=0.02, latency=0.001)
+
+
+def test_kind_true_is_a_kind_though_yaml_takes_it_for_a_boolean() -> None:
+    loop = settings_of(SMALL + "loop: {velocity: {kind: true}}").loop
+    assert isinstance(loop, SampledLoop)
+    assert loop.velocity == TrueVelocity()
+    assert "must be one of filtered_derivative" in refusal(SMALL + "loop: {velocity: {kind: false}}")
 
 
 def test_an_override_changes_the_file_for_all_variants_and_one_below_variants_only_that_one() -> None:
@@ -646,7 +654,7 @@ def test_the_defaults_on_the_page_are_those_of_the_classes() -> None:
     sections = re.split(r"^#+ ", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE)
     for cls in parameter_classes():
         for field in dataclasses.fields(cls):
-            if not isinstance(field.default, (int, float, str)):
+            if field.name == "kind" or not isinstance(field.default, (int, float, str)):
                 continue
             word = str(field.default).lower() if isinstance(field.default, bool) else f"{field.default}"
             rows = [

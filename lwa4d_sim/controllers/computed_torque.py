@@ -9,7 +9,16 @@ import numpy as np
 from lwa4d_sim.controllers.belief import Belief
 from lwa4d_sim.controllers.gains import Gain, gain_rows
 from lwa4d_sim.controllers.task import Posture, PostureLaw, apply, operational_space, task_state
-from lwa4d_sim.interfaces import Array, ArmModel, Controller, JointReference, JointState, Positive, TaskReference
+from lwa4d_sim.interfaces import (
+    STRICT,
+    ArmModel,
+    Array,
+    Controller,
+    JointReference,
+    JointState,
+    Positive,
+    TaskReference,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +38,7 @@ class ComputedTorque:
         model: what the controller believes about the arm.
     """
 
-    __pydantic_config__: ClassVar[Any] = {"extra": "forbid", "allow_inf_nan": False}
+    __pydantic_config__: ClassVar[Any] = STRICT
     kind: Literal["computed_torque"] = "computed_torque"
     space: Literal["joint", "task"] = "joint"
     p: Positive | None = None

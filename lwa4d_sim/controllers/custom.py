@@ -9,7 +9,7 @@ import numpy as np
 
 from lwa4d_sim.controllers.belief import Belief
 from lwa4d_sim.errors import ScenarioError
-from lwa4d_sim.interfaces import Array, ArmModel, Controller, JointState
+from lwa4d_sim.interfaces import STRICT, ArmModel, Array, Controller, JointState
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +23,7 @@ class CustomController:
         options: every other key of the scenario's controller block, passed to the class by name.
     """
 
-    __pydantic_config__: ClassVar[Any] = {"extra": "forbid", "allow_inf_nan": False}
+    __pydantic_config__: ClassVar[Any] = STRICT
     kind: str
     space: Literal["joint", "task"] = "joint"
     model: Belief = Belief()

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lwa4d_sim.controllers.gains import Gain, gain_rows
-from lwa4d_sim.interfaces import Array, JointState, RigidBodyTerms, TaskReference
+from lwa4d_sim.interfaces import STRICT, Array, JointState, RigidBodyTerms, TaskReference
 from lwa4d_sim.rotations import rotation_vector
 
 # Below this smallest singular value of J (m for the rows of a 3-D task, mixed m and 1 for a 6-D one) the inverse is
@@ -25,7 +25,7 @@ class Posture:
         kd: damping [N m s/rad] or [1/s], likewise.
     """
 
-    __pydantic_config__: ClassVar[Any] = {"extra": "forbid", "allow_inf_nan": False}
+    __pydantic_config__: ClassVar[Any] = STRICT
     kp: Gain = 0.0
     kd: Gain = 0.0
 
@@ -61,7 +61,8 @@ def task_state(state: JointState, ref: TaskReference, terms: RigidBodyTerms) -> 
 
 def apply(A: Array, v: Array) -> Array:
     """Matrix-vector product of stacks: (N, m, n) and (N, n) to (N, m)."""
-    return np.matmul(A, v[..., None])[..., 0]
+    product: Array = np.matmul(A, v[..., None])[..., 0]
+    return product
 
 
 @dataclass(frozen=True, slots=True)
