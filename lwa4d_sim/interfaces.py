@@ -4,7 +4,6 @@ Arrays have a leading axis of N simulations stepped together; a single run is N 
 ``(N, n)`` with n joints. Units are SI on the link side; simulated time is integer nanoseconds.
 """
 
-from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple, NewType, Protocol
 
 import numpy as np
@@ -36,16 +35,14 @@ class Pose(NamedTuple):
     R: Array
 
 
-@dataclass(frozen=True, slots=True)
-class JointState:
+class JointState(NamedTuple):
     """What the controller believes about the joints now: ``q`` [rad] and ``dq`` [rad/s], both (N, n)."""
 
     q: Array
     dq: Array
 
 
-@dataclass(frozen=True, slots=True)
-class JointReference:
+class JointReference(NamedTuple):
     """Desired joint motion: ``q`` [rad], ``dq`` [rad/s], ``ddq`` [rad/s^2], each (..., n)."""
 
     q: Array
@@ -53,8 +50,7 @@ class JointReference:
     ddq: Array
 
 
-@dataclass(frozen=True, slots=True)
-class TaskReference:
+class TaskReference(NamedTuple):
     """Desired tool motion in the base frame.
 
     Attributes:
@@ -73,8 +69,7 @@ class TaskReference:
     posture: Array | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Measurement:
+class Measurement(NamedTuple):
     """What the drives latched: ``q`` (N, n) [rad] and, when a drive estimates it, ``dq`` (N, n) [rad/s].
 
     ``stamp`` [ns], (N, n) or (1, 1), is the instant each joint was sampled; joints may differ in age. A joint that has
@@ -86,8 +81,7 @@ class Measurement:
     dq: Array | None
 
 
-@dataclass(frozen=True, slots=True)
-class Arrived:
+class Arrived(NamedTuple):
     """The newest data at an instant, joint by joint.
 
     Attributes:

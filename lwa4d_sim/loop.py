@@ -6,7 +6,7 @@ arrived, computes and sends; the plant goes on under the newest command that act
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -99,8 +99,7 @@ class Timing:
     ticks: int
 
 
-@dataclass(frozen=True, slots=True)
-class Tick:
+class Tick(NamedTuple):
     """What happened in one period; arrays of ``q``, ``dq``, ``tau`` may be reused by the next.
 
     Attributes:

@@ -1,7 +1,6 @@
 """The desired motion as the loop needs it: sampled in blocks of ticks, stacked over simulations."""
 
 from collections.abc import Sequence
-from dataclasses import fields
 from typing import Any, Literal
 
 import numpy as np
@@ -46,6 +45,6 @@ class ReferenceBlocks:
         ]
         self._start = k
         self._columns = []
-        for field in fields(self._type):
-            parts = [getattr(one, field.name) for one in sampled]
+        for name in self._type._fields:
+            parts = [getattr(one, name) for one in sampled]
             self._columns.append(None if parts[0] is None else np.stack(parts, axis=1))
