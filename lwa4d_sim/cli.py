@@ -186,7 +186,8 @@ def _video(scenario: Any, folder: Path) -> None:
     from lwa4d_sim.video import animate
 
     logs = {name: RunLog.load(folder / f"{name}.h5") for name in scenario.variants}
-    animate(logs, folder / "arm.gif", load_model(scenario.document["arm"], base=scenario.folder))
+    first = next(iter(scenario.variants.values()))
+    animate(logs, folder / "arm.gif", load_model(first.arm, base=scenario.folder))
 
 
 def _print_summary(summary: Mapping[str, Any]) -> None:

@@ -10,6 +10,40 @@ from lwa4d_sim.interfaces import NS_PER_S, Array, JointReference, Ns, TaskRefere
 _BLOCK = 512  # ticks sampled at a time: one vectorised call instead of many small ones, and bounded memory
 
 
+class Remembered:
+    """A trajectory that many runs share: every run asks for the same instants, and only the first waits for them."""
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self._trajectory = trajectory
+        self._answers: dict[tuple[str, bytes], Any] = {}
+
+    @property
+    def duration(self) -> float:
+        return self._trajectory.duration
+
+    @property
+    def knots(self) -> Array:
+        return self._trajectory.knots
+
+    def joint(self, t: Array) -> JointReference:
+        motion: JointReference = self._ask("joint", t)
+        return motion
+
+    def task(self, t: Array) -> TaskReference:
+        motion: TaskReference = self._ask("task", t)
+        return motion
+
+    def tool_point(self, t: Array) -> Array:
+        point: Array = self._ask("tool_point", t)
+        return point
+
+    def _ask(self, what: str, t: Array) -> Any:
+        key = (what, t.tobytes())
+        if key not in self._answers:
+            self._answers[key] = getattr(self._trajectory, what)(t)
+        return self._answers[key]
+
+
 class ReferenceBlocks:
     """References of N simulations at the instants of computation.
 

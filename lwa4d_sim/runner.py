@@ -25,15 +25,15 @@ from lwa4d_sim.mjcf import chain_of, home, load_model, torque_limits
 from lwa4d_sim.plant import Plant
 from lwa4d_sim.record import RunLog
 from lwa4d_sim.recorder import RunInfo, record
-from lwa4d_sim.references import ReferenceBlocks
+from lwa4d_sim.references import ReferenceBlocks, Remembered
 from lwa4d_sim.scenario import Scenario
 from lwa4d_sim.settings import IdealLoop, SampledLoop, Settings
 
 # A run longer than this many plant steps is taken for a mistake (assumed; 5 h of simulated time at 1 ms).
 MAX_STEPS = 20_000_000
-# Runs stepped together in one piece: enough to keep all threads busy, few enough to bound memory (20 s of 7 joints at
-# 1 ms are 3.4 MB a run).
-CHUNK = 64
+# Runs stepped together share this much memory for their records (assumed: what any machine can spare; 76 runs of 20 s,
+# 7 joints and 1 ms). Few runs would waste threads, so there are never fewer than the second number.
+RECORD_BUDGET, LEAST_CHUNK = 256_000_000, 16
 # Numbers of the random streams; a new source of randomness takes a new number and leaves the others' draws alone.
 _MEASUREMENT, _COMMAND = 1, 2
 
@@ -87,12 +87,18 @@ def run_batch(
         threads: threads to step on (0: all CPUs).
 
     Yields:
-        One log per member. Logs of at most `CHUNK` members exist at a time if the caller lets go of them.
+        One log per member. Only a part of them exists at a time (`RECORD_BUDGET`) if the caller lets go of them.
     """
     name = _variant(scenario, variant)
-    for start in range(0, len(members), CHUNK):
-        chunk = [scenario.changed(member, name) for member in members[start : start + CHUNK]]
-        yield from _simulate(chunk, name, threads)
+    size = LEAST_CHUNK
+    start = 0
+    while start < len(members):
+        chunk = [scenario.changed(member, name) for member in members[start : start + size]]
+        start += size
+        for log in _simulate(chunk, name, threads):
+            whole = 3 * log.q[0].nbytes * log.step_at(log.knots[-1])  # even where this one run was cut short
+            size = max(LEAST_CHUNK, RECORD_BUDGET // whole)
+            yield log
 
 
 def _variant(scenario: Scenario, variant: str | None) -> str:
@@ -218,6 +224,8 @@ def _trajectories(members: Sequence[Settings], arm: _Arm, q0: Array, folder: Pat
         member.trajectory.build(arm.kinematics, q0[k], folder)
         for k, member in enumerate(members[:1] if same else members)
     ]
+    if same and len(members) > 1:
+        built = [Remembered(built[0])]
     if any(trajectory.duration != built[0].duration for trajectory in built):
         raise ScenarioError("all members of a batch must have the same duration")
     return built

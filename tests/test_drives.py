@@ -154,5 +154,7 @@ def test_resolution_reaches_record_and_controller() -> None:
     })  # fmt: skip
     log = run(Scenario.parse(text))
     np.testing.assert_allclose(log.ticks.q, np.rint(log.ticks.q_true / 0.01) * 0.01, atol=1e-15)
-    np.testing.assert_allclose(log.tau[:-1:10, :2], np.rint(log.ticks.tau[:, :2] / [0.5, 0.25]) * [0.5, 0.25], atol=1e-12)
+    np.testing.assert_allclose(
+        log.tau[:-1:10, :2], np.rint(log.ticks.tau[:, :2] / [0.5, 0.25]) * [0.5, 0.25], atol=1e-12
+    )
     np.testing.assert_array_equal(log.tau[:-1:10, 2], log.ticks.tau[:, 2])

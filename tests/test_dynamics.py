@@ -70,7 +70,9 @@ def test_the_closed_form_agrees(name: str, edits: dict[str, Any]) -> None:
 
 
 def test_the_printed_arm_has_the_lighter_elbow() -> None:
-    physical, printed = (nominal(name, 1).at(np.zeros((1, 3))).M[0, 2, 2] for name in ("lwa4d_3dof", "lwa4d_3dof_printed"))
+    physical, printed = (
+        nominal(name, 1).at(np.zeros((1, 3))).M[0, 2, 2] for name in ("lwa4d_3dof", "lwa4d_3dof_printed")
+    )
     assert printed / physical == pytest.approx(0.76, abs=0.005)  # 24 % less: its inertia stands in the wrong frame
 
 
@@ -122,7 +124,9 @@ def test_gravity_is_the_slope_of_the_potential(name: str) -> None:
     q, _ = states(model.nv, 5)
     g, step = Dynamics(model).g(q), 1e-5
     for i, j in np.ndindex(q.shape):
-        slope = (potential(q[i] + step * np.eye(model.nv)[j]) - potential(q[i] - step * np.eye(model.nv)[j])) / (2 * step)
+        slope = (potential(q[i] + step * np.eye(model.nv)[j]) - potential(q[i] - step * np.eye(model.nv)[j])) / (
+            2 * step
+        )
         assert g[i, j] == pytest.approx(slope, abs=1e-7)
 
 
@@ -179,5 +183,7 @@ def test_the_closed_form_says_what_it_cannot_describe() -> None:
         ArmEdits(payload=Payload(mass=1.0, com=(0.0, 0.02, 0.0))),
         ArmEdits(gravity=(1.0, 0.0, -9.81)),
     ):
-        with pytest.raises(ModelError, match="gravity along z and every link's mass on the link's axis; use dynamics: mujoco"):
+        with pytest.raises(
+            ModelError, match="gravity along z and every link's mass on the link's axis; use dynamics: mujoco"
+        ):
             ClosedForm3(load_model("lwa4d_3dof", edits))

@@ -142,7 +142,9 @@ def test_backward_difference_goes_by_the_stamps() -> None:
     assert speed(2 * TICK, [TICK, TICK], [5.01, 6.98]) == pytest.approx([1.0, -2.0])
     assert speed(3 * TICK, [TICK, 2 * TICK], [5.01, 6.96]) == pytest.approx([1.0, -2.0])  # first joint's sample lost
     assert speed(4 * TICK, [TICK, 2 * TICK], [5.01, 6.96]) == pytest.approx([1.0, -2.0])  # nothing new at all
-    assert speed(5 * TICK, [4 * TICK, 4 * TICK], [5.10, 7.00]) == pytest.approx([3.0, 2.0])  # over three periods, over two
+    assert speed(5 * TICK, [4 * TICK, 4 * TICK], [5.10, 7.00]) == pytest.approx(
+        [3.0, 2.0]
+    )  # over three periods, over two
     assert speed(6 * TICK, [4 * TICK + 1234, 5 * TICK], [5.10 + 1.234e-6, 7.0]) == pytest.approx([1.0, 0.0], rel=1e-6)
 
 

@@ -25,7 +25,9 @@ Q3 = np.array([[-1.5, -1.0, 1.0]])
 Q7 = np.array([[-1.5, 0.3, 0.2, 1.5, 0.1, 0.4, 0.2]])
 
 
-def model(name: str = "lwa4d_3dof", *, timestep: float = 0.001, integrator: str = "RK4", **edits: Any) -> mujoco.MjModel:
+def model(
+    name: str = "lwa4d_3dof", *, timestep: float = 0.001, integrator: str = "RK4", **edits: Any
+) -> mujoco.MjModel:
     return load_model(name, ArmEdits(**edits), timestep=timestep, integrator=integrator, tool_body=True)
 
 
@@ -54,7 +56,9 @@ def closed_form_swing(tau: Array, duration: float = FALL) -> Array:
 def test_rk4_is_exact_and_of_fourth_order() -> None:
     tau = np.array([3.0, -40.0, -10.0])
     truth = closed_form_swing(tau)
-    errors = [np.abs(np.concatenate([part[-1] for part in swing(dt, tau)]) - truth).max() for dt in (0.01, 0.005, 0.001)]
+    errors = [
+        np.abs(np.concatenate([part[-1] for part in swing(dt, tau)]) - truth).max() for dt in (0.01, 0.005, 0.001)
+    ]
     assert errors[0] / errors[1] == pytest.approx(16, rel=0.3)
     assert errors[2] < 5e-9
     euler = np.abs(swing(0.001, tau, integrator="Euler")[0][-1] - truth[:3]).max()
@@ -67,7 +71,9 @@ def test_energy_is_kept_without_friction(name: str, q0: Array) -> None:
     plant = Plant(compiled, q0)
     q, dq = plant.advance(np.zeros((1, 1, q0.shape[1])), 300)
     states = [np.concatenate([q0, q[0, ::30]]), np.concatenate([0 * q0, dq[0, ::30]])]
-    kinetic = 0.5 * np.einsum("ti,tij,tj->t", states[1], NominalModel(compiled, len(states[0])).at(*states).M, states[1])
+    kinetic = 0.5 * np.einsum(
+        "ti,tij,tj->t", states[1], NominalModel(compiled, len(states[0])).at(*states).M, states[1]
+    )
     data, potential = mujoco.MjData(compiled), []
     for angles in states[0]:
         data.qpos[:] = angles
@@ -163,7 +169,9 @@ def test_pushes_start_and_end_on_the_grid_and_add_up() -> None:
     half = Disturbance(at=0.002, duration=0.003, force=(0.0, 10.0, 0.0))
     edits = model(gravity=(0.0, 0.0, 0.0))
     two = Plant(edits, Q3, [half, half]).advance(np.zeros((1, 1, 3)), 10)[0]
-    one = Plant(edits, Q3, [Disturbance(at=0.002, duration=0.003, force=(0.0, 20.0, 0.0))]).advance(np.zeros((1, 1, 3)), 10)
+    one = Plant(edits, Q3, [Disturbance(at=0.002, duration=0.003, force=(0.0, 20.0, 0.0))]).advance(
+        np.zeros((1, 1, 3)), 10
+    )
     np.testing.assert_array_equal(two, one[0])
 
 

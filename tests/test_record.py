@@ -1,4 +1,4 @@
-"""Records on disk: what is written is read back, the page describes it, and no half file ever takes a good one's place."""
+"""Records on disk: what is written is read back, the page describes it, no half file takes a good one's place."""
 
 import dataclasses
 import json
@@ -25,7 +25,7 @@ trajectory:
 controller: {kind: pd_gravity, kp: 200, kd: 60}
 loop: {latency: {measurement: 0.025, command: 0.003}, phase: 0.0, loss: 0.2}
 plant: {seed: 3}
-variants: {can: {}, ideal: {loop: {kind: ideal}}, wild: {controller: {kd: 90000}}}
+variants: {can: {}, ideal: {loop: {kind: ideal}}, wild: {plant: {disturbances: [{at: 0.1, force: [1e+8, 0, 0]}]}}}
 """
 
 

@@ -66,8 +66,8 @@ def load_object(kind: str, key: str, options: Mapping[str, Any]) -> Any:
     try:
         factory = getattr(importlib.import_module(module_name), class_name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ScenarioError(f"{key} (={kind!r}): {error}; give package.module:Class, importable from here") from error
+        raise ScenarioError(f"{error}; give package.module:Class, importable from here", key=key) from error
     try:
         return factory(**options)
     except (TypeError, ValueError) as error:
-        raise ScenarioError(f"{key} (={kind!r}): cannot be made from {dict(options)}: {error}") from error
+        raise ScenarioError(f"cannot be made from {dict(options)}: {error}", key=key) from error
