@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 # What counts as shaking, all assumed; docs/validation.md shows where they lie against the shipped scenarios.
 SMOOTH_WINDOW = 0.4  # [s] motion that a cubic over this window follows is motion, the rest is vibration
 VIBRATION_FLOOR = 0.02  # [rad/s] rms below which nobody would see or hear it
+VIBRATION_SHARE = 0.1  # of the joint's rms speed: what a cubic misses of a fast but smooth motion stays below
 VIBRATION_LIMIT = 0.4  # [rad/s] rms that is unstable in any case: the rated speed of the slow joints
 RUNAWAY = 3.0  # [rad/s] more than twice the rated speed of the fastest joint
 DECAY = 0.9  # a vibration that keeps more than this from one window to the next does not decay
@@ -144,16 +145,17 @@ def vibrations(log: "RunLog") -> tuple[list[float | None], float | None]:
 
     Vibration is what a cubic fitted over `SMOOTH_WINDOW` (Savitzky and Golay 1964) leaves of the joint speed; a segment
     of less than a second has none that could be told from motion. A segment is unstable when, in its last second (or
-    quarter), the vibration is above the floor and has not decayed against the stretch before, or is above the limit
-    anyway. The onset is the start of the stretch in which the running rms stays above the floor; where a run diverges,
-    of the stretch in which some joint is too fast for any drive.
+    quarter), the vibration is above the floor, a good share of the speed, and has not decayed against the stretch
+    before, or is above the limit anyway. The onset is the start of the stretch in which the running rms stays above the
+    floor; where a run diverges, of the stretch in which some joint is too fast for any drive.
     """
     # half a control period resolves every frequency a sampled loop can have; the ideal loop has none of its own
     finest = log.period // 2 if log.period > log.timestep else _COARSE
     stride = max(1, min(finest, _COARSE) // log.timestep)
     h = stride * log.timestep / NS_PER_S
     half = max(2, round(0.5 * SMOOTH_WINDOW / h))
-    signal = vibrating(log.dq[::stride], half)
+    coarse = log.dq[::stride]
+    signal = vibrating(coarse, half)
     power = (signal**2).max(axis=1)
     values: list[float | None] = []
     since: float | None = None
@@ -173,7 +175,9 @@ def vibrations(log: "RunLog") -> tuple[list[float | None], float | None]:
         before = np.sqrt(np.mean(signal[b - 2 * window : b - window] ** 2, axis=0))
         now = np.sqrt(np.mean(signal[b - window : b] ** 2, axis=0))
         values.append(float(now.max()))
-        shaking = (now > VIBRATION_FLOOR) & (now > DECAY * before) | (now > VIBRATION_LIMIT)
+        speed = np.sqrt(np.mean(coarse[b - window : b] ** 2, axis=0))
+        lasting = (now > VIBRATION_FLOOR) & (now > VIBRATION_SHARE * speed) & (now > DECAY * before)
+        shaking = lasting | (now > VIBRATION_LIMIT)
         if shaking.any() and since is None:
             since = (a + _onset(power[a:b], window, h)) * h
     return values, since

@@ -21,7 +21,7 @@ SMALL: dict[str, Any] = {
     "name": "small",
     "arm": "lwa4d_3dof",
     "trajectory": {"waypoints": {"space": "joint", "points": [[0.1, -1.5, 1.5]]}, "segment_time": 0.1},
-    "controller": {"kind": "pd_gravity", "kp": 100.0, "kd": 30.0},
+    "controller": {"kind": "pd_gravity", "kp": 10.0, "kd": 5.0},
 }
 TASK = {"trajectory": {"waypoints": {"space": "task", "points": [[0.5, -0.3, 0.4]]}, "segment_time": 0.1}}
 
@@ -222,7 +222,7 @@ PER_JOINT = {
 def test_a_list_that_is_not_one_a_joint_is_refused(key: str, call: Callable[..., Result]) -> None:
     write("x.yaml")
     result = call("run", "x.yaml", "--set", f"{key}={json.dumps(PER_JOINT[key])}")
-    refused(result, f"x.yaml: {key.split('.')[0]}" if "plant" not in key else "x.yaml")
+    refused(result, "x.yaml")
     assert any(word in result.err for word in (" 2 ", "3 numbers", "1 rows"))
 
 
@@ -239,7 +239,7 @@ def test_a_list_that_is_not_one_a_joint_is_refused(key: str, call: Callable[...,
         ({"plant": {"timestep": 1e-12}}, "plant.timestep (=1e-12): 1e-12 s is not a whole number of nanoseconds"),
         ({"plant": {"timestep": 1e-9}}, "more than 20000000 steps"),
         ({"plant": {"timestep": 0.003}}, "0.01 s is not a whole multiple of the plant step 0.003 s; nearest: 0.009"),
-        ({"loop": {"period": 0.0105}}, "x.yaml:14: loop.period (=0.0105): 0.0105 s is not a whole multiple of the"),
+        ({"loop": {"period": 0.0105}}, "x.yaml:16: loop.period (=0.0105): 0.0105 s is not a whole multiple of the"),
         ({"loop": {"period": -0.01}}, "loop.period (=-0.01): must be a number above 0"),
         ({"loop": {"phase": 0.01}}, "loop.phase (=0.01): "),
         ({"plant": {"payload": {"mass": -1}}}, "plant.payload.mass (=-1): must be a number of at least 0"),
@@ -249,7 +249,10 @@ def test_a_list_that_is_not_one_a_joint_is_refused(key: str, call: Callable[...,
             {"controller": {"kind": "pid"}},
             "controller.kind (='pid'): must be one of pd_gravity, computed_torque, package",
         ),
-        ({"controller": {"kind": "computed_torque"}}, "controller (a mapping): give either p, or both kp and kd"),
+        (
+            {"controller": {"kind": "computed_torque"}},
+            "x.yaml:11: controller (a mapping): give either p, or both kp and kd",
+        ),
         ({"controller": {"kind": "no.such:Law"}}, "No module named 'no'"),
         ({"controller": {"kind": "json:Law"}}, "has no attribute 'Law'"),
         ({"controller": {"kind": "builtins:dict"}}, "has no method torque"),
@@ -270,7 +273,7 @@ def test_a_list_that_is_not_one_a_joint_is_refused(key: str, call: Callable[...,
         ({**TASK, "arm": "lwa4d_7dof"}, "orientations is missing"),
         (
             {"variants": {"ok": {}, "bad": {"initial": {"q": [0]}}}},
-            "x.yaml:17: initial.q of variant 'bad' (=[0]): has 1",
+            "x.yaml:19: initial.q of variant 'bad' (=[0]): has 1",
         ),
     ],
 )
@@ -316,8 +319,8 @@ def test_a_file_that_is_no_scenario_gets_one_line(content: bytes, words: str, ca
             "--set controller.kp: not valid YAML: while parsing a flow seq",
         ),
         (["run", "x.yaml", "--set", "controller.kp=.inf"], "--set controller.kp (=.inf): must be a finite number"),
-        (["run", "x.yaml", "--set", "controller.kq=1"], "controller.kq (=1, overridden): unknown key; did you mean"),
-        (["run", "x.yaml", "--set", "controller.kp.a.b=1"], "'a' cannot be set inside the value 100.0"),
+        (["run", "x.yaml", "--set", "controller.kpp=1"], "controller.kpp (=1, overridden): unknown key; did you mean"),
+        (["run", "x.yaml", "--set", "controller.kp.a.b=1"], "'a' cannot be set inside the value 10.0"),
         (["run", "x.yaml", "--set", "loop=3"], "loop (=3, overridden): must be a mapping of kind sampled or ideal"),
         (["run", "x.yaml", "--set", "controller=null"], "controller (=null, overridden): must be a mapping of kind"),
         (["run", "x.yaml", "--set", "trajectory.waypoints.points.7=[0,0,0]"], "'7' must be a position from 0 to 0"),

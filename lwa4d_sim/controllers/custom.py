@@ -29,6 +29,11 @@ class CustomController:
     model: Belief = Belief()
     options: Mapping[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        """Leave every other kind to the shipped controllers (ValueError)."""
+        if ":" not in self.kind:
+            raise ValueError("kind must be package.module:Class")
+
     def create(self) -> Controller:
         """Import the class and make one.
 
@@ -65,7 +70,7 @@ def load_object(kind: str, key: str, options: Mapping[str, Any]) -> Any:
     module_name, _, class_name = kind.partition(":")
     try:
         factory = getattr(importlib.import_module(module_name), class_name)
-    except (ImportError, AttributeError, ValueError) as error:
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise ScenarioError(f"{error}; give package.module:Class, importable from here", key=key) from error
     try:
         return factory(**options)
