@@ -3,9 +3,10 @@
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,8 +67,8 @@ def run_files(files: Sequence[Path], out: Path | None, *, plots: bool, workers: 
     if workers <= 1 or len(files) <= 1:
         yield from (_run_file(file, out, plots) for file in files)
         return
-    with _pool(min(workers, len(files))) as pool:
-        futures = [pool.submit(_run_file, file, out, plots) for file in files]
+    pool, futures = _submit(files, out, plots, min(workers, len(files)))
+    with pool:
         try:
             for file, future in zip(files, futures, strict=True):
                 try:
@@ -79,19 +80,27 @@ def run_files(files: Sequence[Path], out: Path | None, *, plots: bool, workers: 
             raise
 
 
-def _pool(workers: int) -> ProcessPoolExecutor:
-    """Worker processes that leave Ctrl-C to this one, so that what they write is whole.
-
-    Spawned, because a forked copy of a process with running threads may hang.
-    """
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers, context, signal.signal, (signal.SIGINT, signal.SIG_IGN))
+def _submit(
+    files: Sequence[Path], out: Path | None, plots: bool, workers: int
+) -> tuple[ProcessPoolExecutor, list[Future[Job]]]:
+    """Processes at work on ``files``. They leave Ctrl-C to this one, so that what they write is whole."""
+    # ignoring is inherited; only the main thread hears of Ctrl-C and may say what to do about it
+    heard = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if heard else None
+    try:
+        # spawned, because a forked copy of a process with running threads may hang
+        pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
+        return pool, [pool.submit(_run_file, file, out, plots) for file in files]
+    finally:
+        if heard:
+            signal.signal(signal.SIGINT, before)
 
 
 def _run_alone(file: Path, out: Path | None, plots: bool) -> Job:
-    with _pool(1) as pool:
+    pool, [future] = _submit([file], out, plots, 1)
+    with pool:
         try:
-            return pool.submit(_run_file, file, out, plots).result()
+            return future.result()
         except BrokenExecutor:
             return Job(file, 0.0, None, f"{file}: the process that ran it was killed; is there enough memory?")
 

@@ -10,11 +10,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from lwa4d_sim.assembly import versions
 from lwa4d_sim.errors import RecordError, ScenarioError
 from lwa4d_sim.expect import evaluate
 from lwa4d_sim.mjcf import model_path
 from lwa4d_sim.record import RunLog
-from lwa4d_sim.runner import measure, run_all, versions
+from lwa4d_sim.runner import measure, run_all
 from lwa4d_sim.scenario import Scenario
 
 _OURS = (".gif", ".h5", ".html", ".json", ".png")  # what a run's folder may hold, and what its next run replaces

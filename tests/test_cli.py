@@ -20,7 +20,7 @@ ROOT = Path(__file__).parent.parent
 SMALL: dict[str, Any] = {
     "name": "small",
     "arm": "lwa4d_3dof",
-    "trajectory": {"waypoints": {"space": "joint", "points": [[0.1, -1.5, 1.5]]}, "segment_time": 0.1},
+    "trajectory": {"waypoints": {"space": "joint", "points": [[-1.5, -1.5, 1.5]]}, "segment_time": 0.1},
     "controller": {"kind": "pd_gravity", "kp": 10.0, "kd": 5.0},
 }
 TASK = {"trajectory": {"waypoints": {"space": "task", "points": [[0.5, -0.3, 0.4]]}, "segment_time": 0.1}}

@@ -120,7 +120,7 @@ def test_joint_laws_are_their_formulas(name: str) -> None:
 
 
 def test_task_laws_are_their_formulas_on_three_joints() -> None:
-    """With a square Jacobian, against the thesis's M J^-1 form, Jacobians from the kinematics and their rate by difference."""
+    """With a square Jacobian, against the thesis's M J^-1 form with the Jacobian of the kinematics."""
     arm = load_arm("lwa4d_3dof")
     state, model = states(3), NominalModel(arm.model, N)
     rng = np.random.default_rng(4)
@@ -170,7 +170,7 @@ def test_posture_is_felt_by_no_task_axis(make: Any) -> None:
     at = model.at(state.q)
     acceleration = np.linalg.solve(at.M, null[..., None])
     np.testing.assert_allclose(at.J @ acceleration, 0.0, atol=1e-10)
-    # and along the one self-motion it pulls towards the posture and brakes, in joint accelerations or in torques as said
+    # and along the one self-motion it pulls towards the posture and brakes
     direction = np.linalg.svd(at.J)[2][:, -1]
     pull = np.array(posture.kp) * 0.3 - 6.0 * state.dq
     weight = np.eye(7) if make is PdGravity else at.M
@@ -302,7 +302,14 @@ def test_gains_may_differ_within_a_batch() -> None:
 def test_computed_torque_wants_its_gains_one_way() -> None:
     assert ComputedTorque(p=3.0).gains == (9.0, 6.0)
     assert ComputedTorque(kp=1.0, kd=2.0).gains == (1.0, 2.0)
-    for wrong in ({}, {"p": 1.0, "kp": 1.0, "kd": 1.0}, {"p": 1.0, "kd": 1.0}, {"kp": 1.0}, {"kd": 1.0}):
+    wrongs: list[dict[str, Any]] = [
+        {},
+        {"p": 1.0, "kp": 1.0, "kd": 1.0},
+        {"p": 1.0, "kd": 1.0},
+        {"kp": 1.0},
+        {"kd": 1.0},
+    ]
+    for wrong in wrongs:
         with pytest.raises(ValueError, match="give either p, or both kp and kd"):
             ComputedTorque(**wrong)
 

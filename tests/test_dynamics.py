@@ -1,9 +1,9 @@
 """Rigid-body terms by several roads: MuJoCo's, the thesis's closed form, Pinocchio's, and finite differences."""
 
-import importlib.util
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -29,11 +29,9 @@ def nominal(name: str, count: int = N, **edits: Any) -> NominalModel:
     return NominalModel(load_model(name, ArmEdits(**edits)), count)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("pinocchio") is None, reason="Pinocchio (package pin) is not installed")
 @EVERY_ARM
 def test_pinocchio_agrees(name: str) -> None:
-    import pinocchio
-
+    pinocchio = pytest.importorskip("pinocchio", reason="Pinocchio (package pin) is not installed")
     other = pinocchio.buildModelFromMJCF(str(MODELS / f"{name}.xml"))
     data = other.createData()
     q, dq = states(other.nv)
@@ -110,8 +108,6 @@ def test_inertia_is_symmetric_positive_and_the_coriolis_matrix_skew(name: str) -
 
 @EVERY_ARM
 def test_gravity_is_the_slope_of_the_potential(name: str) -> None:
-    import mujoco
-
     model = load_model(name)
     data = mujoco.MjData(model)
 

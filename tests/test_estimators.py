@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -71,11 +72,13 @@ def test_continuous_filter_is_the_filter(motion: Motion, tolerance: float, steps
     for k in range(0, 400, steps):
         source.observe(q[:, k : k + steps], dq[:, k : k + steps])
         found.append(source.read())
+
     # independent road: the two first-order lags as differential equations
-    lags = solve_ivp(
-        lambda s, y: [(motion(s)[0] - y[0]) / T, (y[0] - y[1]) / T], (0.0, t[-1]), [start, start], "DOP853",
-        t[steps - 1 :: steps], rtol=1e-13, atol=1e-13, max_step=T,
-    )  # fmt: skip
+    def lag(s: float, y: Array) -> Array:
+        return np.array([(motion(np.array(s))[0] - y[0]) / T, (y[0] - y[1]) / T])
+
+    tight: Any = {"rtol": 1e-13, "atol": 1e-13, "max_step": T}
+    lags = solve_ivp(lag, (0.0, float(t[-1])), [start, start], "DOP853", t[steps - 1 :: steps], **tight)
     expected = (lags.y[0] - lags.y[1]) / T
     np.testing.assert_allclose(np.array(found)[:, 0, 0], expected, atol=tolerance)
     np.testing.assert_allclose(np.array(found)[:, 1, 0], 2.0 * expected, atol=2 * tolerance)
@@ -117,7 +120,7 @@ def test_held_filter_is_the_exact_discretisation(T: float) -> None:
 
 def test_held_filter_is_eight_percent_low_on_a_ramp() -> None:
     found = speeds(HeldFilter(np.zeros((1, 2)), PERIOD, PERIOD), 0.01 * np.arange(200))
-    # by hand: the staircase is the ramp minus a sawtooth; (1 / (e - 1))^2 e is what the filter leaves of a unit step a period
+    # by hand: the sum over k >= 1 of k e^-k, what the filter's impulse responses leave of a unit step a period
     assert found[-1] == pytest.approx(np.e / (np.e - 1.0) ** 2, abs=1e-12)
     assert found[-1] == pytest.approx(0.92, abs=0.005)
 

@@ -122,7 +122,7 @@ def check(log: RunLog, *, period: int, dt: int, phase: int, up: int, down: list[
 def test_asked_delay_is_seen_at_the_plant(period: int, dt: int, actuation: str) -> None:
     latencies = [0, 300_000, period // 2 + 123, period, 2 * period + 700_000]
     for up, down in list(itertools.product(latencies, latencies))[dt // MS :: 2]:
-        loop = {"latency": {"measurement": up / 1e9, "command": down / 1e9}, "period": period / 1e9}
+        loop: dict[str, Any] = {"latency": {"measurement": up / 1e9, "command": down / 1e9}, "period": period / 1e9}
         log = run(scenario(dt=dt / 1e9, duration=10 * period / 1e9, actuation=actuation, **loop))
         phase = up_to(up, dt) % period
         check(log, period=period, dt=dt, phase=phase, up=up, down=[down] * 3, actuation=actuation)
@@ -134,7 +134,7 @@ def test_asked_delay_is_seen_at_the_plant(period: int, dt: int, actuation: str) 
 @pytest.mark.parametrize("phase", [0, MS, 4 * MS, 9 * MS])
 def test_phase_moves_the_computation(phase: int, actuation: str) -> None:
     for up, down in itertools.product([0, 2 * MS, 4 * MS, 12 * MS], [0, MS, 6 * MS]):
-        loop = {"latency": {"measurement": up / 1e9, "command": down / 1e9}, "phase": phase / 1e9}
+        loop: dict[str, Any] = {"latency": {"measurement": up / 1e9, "command": down / 1e9}, "phase": phase / 1e9}
         log = run(scenario(actuation=actuation, **loop))
         check(log, period=10 * MS, dt=MS, phase=phase, up=up, down=[down] * 3, actuation=actuation)
 
@@ -158,6 +158,14 @@ def test_the_controller_waits_for_the_slowest_joint() -> None:
     np.testing.assert_array_equal(late.ticks.q[1:, 2], late.q[at - 13, 2])
 
 
+@pytest.mark.parametrize("kind", ["filtered_derivative", "held", "backward_difference", "tustin", "kalman", "true"])
+def test_no_estimator_is_kicked_by_a_joint_that_speaks_late(kind: str) -> None:
+    velocity = {"kind": "filtered_derivative", "runs_on": "held"} if kind == "held" else {"kind": kind}
+    log = run(scenario(latency={"measurement": [0.0, 0.0021, 0.033]}, phase=0.003, velocity=velocity))
+    assert np.isnan(log.ticks.dq[:3]).all()
+    assert np.abs(log.ticks.dq[3:]).max() < 1e-4  # the arm hardly moves: a kick would be about 1 rad in 10 ms
+
+
 @pytest.mark.parametrize(("period", "dt"), [(3 * MS, MS), (3 * MS, 500_000), (7 * MS, MS)])
 def test_ticks_never_drift(period: int, dt: int) -> None:
     log = run(scenario(dt=dt / 1e9, duration=2000 * period / 1e9, period=period / 1e9))
@@ -166,8 +174,10 @@ def test_ticks_never_drift(period: int, dt: int) -> None:
     np.testing.assert_array_equal(log.tau[:-1, 0] / QUANTUM, expected)
 
 
-@pytest.mark.parametrize(("command", "actuation", "delay"), [(0.0, "immediate", 0), (0.0034, "immediate", 4),
-                                                             (0.0, "next_sync", 10), (0.01, "next_sync", 20)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("command", "actuation", "delay"),
+    [(0.0, "immediate", 0), (0.0034, "immediate", 4), (0.0, "next_sync", 10), (0.01, "next_sync", 20)],
+)
 def test_a_step_of_the_reference_shows_after_the_asked_delay(command: float, actuation: str, delay: int) -> None:
     law = {"kind": "pd_gravity", "kp": 10.0, "kd": 1.0, "model": {"gravity": [0, 0, 0]}}
     log = run(scenario(controller=law, actuation=actuation, latency=command))
