@@ -1,6 +1,7 @@
 """The command line `lwa4d-sim`. Exit codes: 0 fine, 1 an expectation failed, 2 bad input."""
 
 import json
+import os
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -259,6 +260,7 @@ def _progress(text: str, total: int, *, quiet: bool) -> Iterator[Any]:
 
 def main() -> None:
     """Entry point: runs the app and turns every expected error into one line and exit code 2."""
+    sys.path.append(os.getcwd())  # a controller of one's own is found in the folder one works in
     try:
         code = app(sys.argv[1:] or ["--help"], standalone_mode=False) or 0
         if code == _INTERRUPTED:

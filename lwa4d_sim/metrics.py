@@ -54,6 +54,10 @@ def metrics(log: "RunLog") -> dict[str, Any]:
     x_ref -= x  # in place: the paths are a tenth of a long record each
     error = np.sqrt(np.einsum("ij,ij->i", x_ref, x_ref))
     del x_ref
+    final = [
+        None if goal is None else float(np.linalg.norm(x[end] - goal))
+        for goal, (_, end) in zip(goals, _segments(log), strict=True)
+    ]
     ticks = log.ticks
     joint_error = ticks.q_ref - ticks.q_true
     known = ~np.isnan(ticks.dq).any(axis=1)
@@ -63,11 +67,8 @@ def metrics(log: "RunLog") -> dict[str, Any]:
         "stable": diverged is None and since is None,
         "unstable_since": since if since is not None else diverged,
         "diverged_at": diverged,
-        "final_error": [
-            None if goal is None else float(np.linalg.norm(x[end] - goal))
-            for goal, (_, end) in zip(goals, _segments(log), strict=True)
-        ],
-        "max_error": float(error.max()),
+        "final_error": final,
+        "max_error": max([float(error.max()), *(e for e in final if e is not None)]),
         "rms_error": _rms(error),
         "settling_time": _settling(log, x, goals),
         "max_joint_error": _per_joint(np.abs(joint_error), np.max),
@@ -221,7 +222,7 @@ def _rms(values: Array) -> float:
 
 def _peaks(values: Array) -> list[float]:
     """Largest magnitude of each column, without a copy of the whole record."""
-    peaks: list[float] = np.maximum(values.max(axis=0), -values.min(axis=0)).tolist()
+    peaks: list[float] = np.abs(np.maximum(values.max(axis=0), -values.min(axis=0))).tolist()  # abs: no -0.0
     return peaks
 
 

@@ -170,9 +170,9 @@ def _add_tool_body(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     site = tool_site(model)
     if site >= 0:
         frame = spec.site(model.site(site).name)
-        frame.parent.add_body(name="tool", pos=frame.pos, quat=frame.quat)
+        frame.parent.add_body(name="tool", pos=frame.pos, quat=frame.quat, ipos=(0, 0, 0))
     else:
-        spec.bodies[-1].add_body(name="tool")
+        spec.bodies[-1].add_body(name="tool", ipos=(0, 0, 0))
 
 
 def torque_limits(model: mujoco.MjModel) -> Array:

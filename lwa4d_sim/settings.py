@@ -9,8 +9,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Lt
 
-from lwa4d_sim.channels import Latency, Loss, Transport
+from lwa4d_sim.channels import Transport
 from lwa4d_sim.controllers import ControllerParameters
+from lwa4d_sim.delays import Latency, Loss
 from lwa4d_sim.drives import LateData
 from lwa4d_sim.estimators import FilteredDerivative, VelocityParameters
 from lwa4d_sim.interfaces import STRICT, NonNegative, Positive

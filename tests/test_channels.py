@@ -7,15 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lwa4d_sim.channels import (
+from lwa4d_sim.channels import Gate, Transport
+from lwa4d_sim.delays import (
     ExponentialLatency,
-    Gate,
     LatencyDraws,
     Loss,
     LossDraws,
     NormalLatency,
     TraceLatency,
-    Transport,
     UniformLatency,
 )
 from lwa4d_sim.errors import ScenarioError
@@ -125,7 +124,11 @@ def test_random_arrivals_against_brute_force(law: UniformLatency | ExponentialLa
     transport = Transport(latency=law, jitter=0.002, loss=Loss(probability=0.3, mean_burst=2.0), per_joint=per_joint)
     seeds = [np.random.SeedSequence(seed, spawn_key=(1, 0)) for seed in range(N)]
     loss_seeds = [np.random.SeedSequence(seed, spawn_key=(1, 1)) for seed in range(N)]
-    latency, loss = LatencyDraws(transport, seeds, JOINTS), LossDraws(transport, loss_seeds, JOINTS)
+    width = JOINTS if transport.per_joint else 1
+    latency, loss = (
+        LatencyDraws(transport.latency, transport.jitter, width, seeds),
+        LossDraws(transport.loss, width, loss_seeds),
+    )
     shape = (N, JOINTS)
     period, count = 10 * MS, 300
     arrival = np.array([k * period + np.broadcast_to(latency.next(), shape) for k in range(count)])
@@ -182,7 +185,7 @@ LOSSES = [Loss(probability=0.2), Loss(probability=0.7), Loss(probability=0.3, me
 @pytest.mark.parametrize("loss", LOSSES, ids=str)
 def test_loss_has_the_asked_share_and_burst_length(loss: Loss) -> None:
     sims, count = 40, 8000
-    draws = LossDraws(Transport(loss=loss), [np.random.SeedSequence(seed) for seed in range(sims)], JOINTS)
+    draws = LossDraws(loss, 1, [np.random.SeedSequence(seed) for seed in range(sims)])
     lost = np.array([draws.next()[:, 0] for _ in range(count)]).T  # (sims, count)
     p, leave = loss.probability, loss.leave
     mean_burst = loss.mean_burst or 1.0 / (1.0 - p)
@@ -219,7 +222,7 @@ def test_per_joint_draws_joint_by_joint(per_joint: bool) -> None:
     ],
 )
 def test_laws_have_their_moments(law: UniformLatency | NormalLatency | ExponentialLatency) -> None:
-    draws = LatencyDraws(Transport(latency=law), [np.random.SeedSequence(seed) for seed in range(20)], 1)
+    draws = LatencyDraws(law, 0.0, 1, [np.random.SeedSequence(seed) for seed in range(20)])
     seconds = np.array([draws.next() for _ in range(2000)]) / 1e9
     mean, std = {
         "uniform": (0.0055, 0.007 / np.sqrt(12)), "normal": (0.005, 0.001), "exponential": (0.005, 0.002)
@@ -233,10 +236,10 @@ def test_laws_have_their_moments(law: UniformLatency | NormalLatency | Exponenti
 def test_jitter_is_added_and_a_trace_is_replayed() -> None:
     trace = TraceLatency(values=(0.001, 0.004, 0.002))
     seeds = [np.random.SeedSequence(seed) for seed in range(2)]
-    plain = LatencyDraws(Transport(latency=trace), seeds, JOINTS)
+    plain = LatencyDraws(trace, 0.0, 1, seeds)
     assert [plain.next().ravel().tolist() for _ in range(4)] == [[MS, MS], [4 * MS] * 2, [2 * MS] * 2, [MS, MS]]
-    plain = LatencyDraws(Transport(latency=trace), seeds, JOINTS)
-    shaken = LatencyDraws(Transport(latency=trace, jitter=0.003), seeds, JOINTS)
+    plain = LatencyDraws(trace, 0.0, 1, seeds)
+    shaken = LatencyDraws(trace, 0.003, 1, seeds)
     extra = np.array([shaken.next() - plain.next() for _ in range(900)]) / 1e9
     assert 0 <= extra.min() < 1e-4
     assert 0.0029 < extra.max() <= 0.003

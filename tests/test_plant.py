@@ -129,10 +129,6 @@ def pushed(push: Disturbance, steps: int, *, gravity: bool = False) -> tuple[Arr
     return np.concatenate([Q3, q[0]]), np.concatenate([0 * Q3, dq[0]])
 
 
-TOOL_BODY = pytest.mark.xfail(reason="mjcf: the tool body lacks ipos=(0, 0, 0), so its centre of mass is elsewhere")
-
-
-@TOOL_BODY
 def test_a_tap_on_the_tool_gives_its_momentum() -> None:
     force = (20.0, -30.0, 40.0)
     _, dq = pushed(Disturbance(at=0.005, duration=0.001, force=force), 10)
@@ -142,9 +138,7 @@ def test_a_tap_on_the_tool_gives_its_momentum() -> None:
     np.testing.assert_allclose(dq[6], expected, rtol=2e-3, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("wrench", "rows"), [pytest.param("force", slice(0, 3), marks=TOOL_BODY), ("torque", slice(3, 6))]
-)
+@pytest.mark.parametrize(("wrench", "rows"), [("force", slice(0, 3)), ("torque", slice(3, 6))])
 def test_a_long_push_acts_at_the_moving_tool(wrench: Any, rows: slice) -> None:
     vector = np.array([5.0, -8.0, 6.0])
     given: Any = {wrench: tuple(vector)}
@@ -316,7 +310,6 @@ def test_a_torque_that_is_no_number_is_no_closed_brake(tmp_path: Path, monkeypat
     assert kept.tau.any()
 
 
-@pytest.mark.xfail(reason="runner: members that differ in plant.disturbances or plant.timestep are not refused")
 @pytest.mark.parametrize(
     "change",
     [

@@ -7,6 +7,7 @@ import pytest
 
 from lwa4d_sim.arm import load_arm
 from lwa4d_sim.errors import KinematicsError, LwaError, ModelError, ScenarioError, TrajectoryError
+from lwa4d_sim.kinematics import SrsKinematics
 from lwa4d_sim.runner import LEAST_CHUNK, run, run_batch
 from lwa4d_sim.scenario import Scenario
 
@@ -165,4 +166,8 @@ def test_the_python_names_of_the_design() -> None:
     q = np.array([0.1, 0.4, -0.2, 1.0, 0.3, -0.5, 0.2])
     assert arm.dynamics.M(q).shape == (7, 7)
     assert arm.dynamics.h(q, 0 * q) == pytest.approx(arm.dynamics.g(q))
-    assert arm.kinematics.ik(*arm.kinematics.fk(q), arm_angle=arm.kinematics.arm_angle_of(q), near=q) == pytest.approx(q)
+    kinematics = arm.kinematics
+    assert isinstance(kinematics, SrsKinematics)
+    again = kinematics.ik(*kinematics.fk(q), arm_angle=kinematics.arm_angle_of(q), near=q)
+    assert again == pytest.approx(q)
+    assert kinematics.jacobian(q).shape == (6, 7)

@@ -14,8 +14,8 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from lwa4d_sim.channels import UniformLatency
 from lwa4d_sim.controllers import ComputedTorque, CustomController, PdGravity
+from lwa4d_sim.delays import UniformLatency
 from lwa4d_sim.errors import ModelError, ReachError, ScenarioError
 from lwa4d_sim.estimators import TrueVelocity
 from lwa4d_sim.metrics import METRICS

@@ -85,9 +85,9 @@ def test_gain_limit_in_simulation(arm: str, runs_on: str) -> None:
     """A small disturbance at each waypoint dies out 3 % below the critical gain and grows 3 % above it."""
     for point, critical in zip(WAYPOINTS, CRITICAL[arm, runs_on], strict=True):
         scenario = Scenario.parse(TEXT.format(arm=arm, point=point, runs_on=runs_on))
-        q = np.asarray(_waypoint(scenario))
+        q = _waypoint(scenario)
         members = [
-            {"controller.kp": p, "controller.kd": 5 * p / 3, "initial.q": (q + [0.0, 2e-4, -2e-4]).tolist()}
+            {"controller.kp": p, "controller.kd": 5 * p / 3, "initial.q": [q[0], q[1] + 2e-4, q[2] - 2e-4]}
             for p in (0.97 * critical, 1.03 * critical)
         ]
         below, above = run_batch(scenario, members)
@@ -98,7 +98,8 @@ def test_gain_limit_in_simulation(arm: str, runs_on: str) -> None:
 
 def _waypoint(scenario: Scenario) -> list[float]:
     log = next(run_batch(scenario, [{}]))
-    return log.ticks.q_ref[-1].tolist()
+    q: list[float] = log.ticks.q_ref[-1].tolist()
+    return q
 
 
 def test_thesis_case_numbers() -> None:

@@ -1,0 +1,179 @@
+"""Laws of latency and loss, and the numbers drawn from them: one generator a simulation, so that runs do not mix."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from annotated_types import Ge, Lt, MinLen
+
+from lwa4d_sim.interfaces import NS_PER_S, STRICT, Array, IntArray, NonNegative
+
+_BLOCK = 256  # draws taken from a generator at a time; fixed, so that a run's bits do not depend on its length
+
+
+@dataclass(frozen=True, kw_only=True)
+class UniformLatency:
+    """Latency drawn evenly between ``low`` and ``high`` [s], in whole multiples of ``step`` where that is given."""
+
+    __pydantic_config__: ClassVar[Any] = STRICT
+    kind: Literal["uniform"] = "uniform"
+    low: NonNegative = 0.0
+    high: NonNegative
+    step: NonNegative = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the order of the bounds (ValueError)."""
+        if self.high < self.low:
+            raise ValueError(f"high (={self.high}) must not be below low (={self.low})")
+
+    def draw(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
+        """Latencies [s] of the given shape."""
+        seconds = rng.uniform(self.low, self.high, shape)
+        return np.rint(seconds / self.step) * self.step if self.step else seconds
+
+    @property
+    def usual_longest(self) -> float:
+        """The upper end [s]."""
+        return self.high
+
+
+@dataclass(frozen=True, kw_only=True)
+class NormalLatency:
+    """Latency drawn from a normal law, cut off at zero [s]."""
+
+    __pydantic_config__: ClassVar[Any] = STRICT
+    kind: Literal["normal"] = "normal"
+    mean: NonNegative
+    std: NonNegative
+
+    def draw(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
+        """Latencies [s] of the given shape."""
+        return np.maximum(rng.normal(self.mean, self.std, shape), 0.0)
+
+    @property
+    def usual_longest(self) -> float:
+        """Mean plus two standard deviations [s]: 97.7 % stay below."""
+        return self.mean + 2.0 * self.std
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExponentialLatency:
+    """A fixed latency plus an exponential tail of the given mean [s]."""
+
+    __pydantic_config__: ClassVar[Any] = STRICT
+    kind: Literal["exponential"] = "exponential"
+    minimum: NonNegative = 0.0
+    tail: NonNegative
+
+    def draw(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
+        """Latencies [s] of the given shape."""
+        return self.minimum + rng.exponential(self.tail, shape)
+
+    @property
+    def usual_longest(self) -> float:
+        """Minimum plus three means of the tail [s]: 95 % stay below."""
+        return self.minimum + 3.0 * self.tail
+
+
+@dataclass(frozen=True, kw_only=True)
+class TraceLatency:
+    """Measured latencies replayed in order [s], from the start again when they run out; all joints alike."""
+
+    __pydantic_config__: ClassVar[Any] = STRICT
+    kind: Literal["trace"] = "trace"
+    values: Annotated[tuple[NonNegative, ...], MinLen(1)]
+
+    @property
+    def usual_longest(self) -> float:
+        """The largest of the trace [s]."""
+        return max(self.values)
+
+
+RandomLaw = UniformLatency | NormalLatency | ExponentialLatency
+# one number for all joints, one number a joint, or a law
+Latency = NonNegative | Annotated[tuple[NonNegative, ...], MinLen(1)] | RandomLaw | TraceLatency
+
+
+@dataclass(frozen=True, kw_only=True)
+class Loss:
+    """Lost samples, alone or in bursts (Gilbert-Elliott: in a burst everything is lost).
+
+    Attributes:
+        probability: long-run share of samples lost, 0 up to (not including) 1.
+        mean_burst: mean number of samples lost in a row; 1 / (1 - probability) is independent loss, the default.
+    """
+
+    __pydantic_config__: ClassVar[Any] = STRICT
+    probability: Annotated[float, Ge(0), Lt(1)] = 0.0
+    mean_burst: Annotated[float, Ge(1)] | None = None
+
+    def __post_init__(self) -> None:
+        """Check that such bursts can have such a share (ValueError)."""
+        if self.mean_burst is not None and self.probability > 0 and self.enter > 1.0:
+            raise ValueError(f"mean_burst (={self.mean_burst}) is too short for probability (={self.probability})")
+
+    @property
+    def leave(self) -> float:
+        """Probability that a burst ends at the next sample."""
+        return 1.0 - self.probability if self.mean_burst is None else 1.0 / self.mean_burst
+
+    @property
+    def enter(self) -> float:
+        """Probability that a burst begins at the next sample."""
+        return self.leave * self.probability / (1.0 - self.probability)
+
+
+class LatencyDraws:
+    """Latencies [ns] of successive samples: constant part plus law plus jitter, one generator a simulation."""
+
+    def __init__(self, latency: Latency, jitter: float, width: int, seeds: Sequence[np.random.SeedSequence]) -> None:
+        self._latency, self._jitter = latency, jitter
+        self._shape = (_BLOCK, width)
+        self._generators = [np.random.default_rng(seed) for seed in seeds]
+        self._index = 0
+        self._block: IntArray = np.empty((0,), np.int64)
+
+    def next(self) -> IntArray:
+        """Latency of the next sample, (N, n) or broadcastable to it."""
+        k = self._index % _BLOCK
+        if k == 0:
+            self._block = np.stack([self._draw(rng) for rng in self._generators], axis=1)
+        self._index += 1
+        latency: IntArray = self._block[k]
+        return latency
+
+    def _draw(self, rng: np.random.Generator) -> IntArray:
+        if isinstance(self._latency, TraceLatency):
+            trace = np.asarray(self._latency.values)
+            seconds = trace[np.arange(self._index, self._index + _BLOCK) % len(trace), None]
+        elif isinstance(self._latency, (float, int, tuple)):
+            seconds = np.broadcast_to(np.asarray(self._latency, float), (_BLOCK, np.size(self._latency)))
+        else:
+            seconds = self._latency.draw(rng, self._shape)
+        if self._jitter:
+            seconds = seconds + rng.uniform(0.0, self._jitter, self._shape)
+        drawn: IntArray = np.rint(seconds * NS_PER_S).astype(np.int64)
+        return drawn
+
+
+class LossDraws:
+    """Which samples are lost, one generator a simulation."""
+
+    def __init__(self, loss: Loss, width: int, seeds: Sequence[np.random.SeedSequence]) -> None:
+        self._loss = loss
+        self._generators = [np.random.default_rng(seed) for seed in seeds]
+        self._width = width
+        self._bad = np.zeros((len(seeds), self._width), bool)
+        self._index = 0
+        self._block: Array = np.empty((0,))
+
+    def next(self) -> Any:
+        """Mask of lost data (N, n) or (N, 1)."""
+        k = self._index % _BLOCK
+        if k == 0:
+            self._block = np.stack([rng.random((_BLOCK, self._width)) for rng in self._generators], axis=1)
+        self._index += 1
+        u = self._block[k]
+        self._bad = np.where(self._bad, u >= self._loss.leave, u < self._loss.enter)
+        return self._bad
