@@ -25,7 +25,7 @@ ROWS = (
     "kinematics arm mjcf_checks",
     "mjcf",
     # blocks
-    "motion_files motions controllers.gains controllers.belief",
+    "motion_files motions delays controllers.gains controllers.belief",
     "controllers.task",
     "controllers.pd_gravity controllers.computed_torque controllers.custom",
     "trajectories references estimators channels drives plant controllers",
@@ -40,6 +40,7 @@ ROWS = (
     "settings yaml_text",
     "schema",
     "scenario",
+    "assembly",
     "runner",
     # work
     "verdict",
@@ -57,7 +58,7 @@ BLOCKS = {
     "trajectories": ("motion_files", "motions", "trajectories"),
     "references": ("references",),
     "estimators": ("estimators",),
-    "channels": ("channels",),
+    "channels": ("delays", "channels"),
     "drives": ("drives",),
     "plant": ("plant",),
     "controllers": ("controllers", "controllers."),
@@ -70,7 +71,7 @@ UPWARD = {
 
 # Where each library is known. NumPy and annotated_types (rules on numbers) may be used anywhere.
 LIBRARIES = {
-    "mujoco": {"dynamics", "mjcf", "mjcf_checks", "plant", "runner", "video"},
+    "mujoco": {"dynamics", "mjcf", "mjcf_checks", "plant", "assembly", "video"},
     "scipy": {"estimators", "trajectories"},
     "pydantic": {"schema"},
     "pydantic_core": {"schema"},
@@ -293,9 +294,9 @@ variants: {ideal: {loop: {kind: ideal}}, can: {}}
     ("arguments", "absent"),
     [
         (["run", "x.yaml", "--no-plots"], {"scipy", "matplotlib", "PIL", "imageio", "jinja2", "rich", "pandas"}),
-        (["--help"], {"scipy", "matplotlib", "PIL", "imageio", "jinja2", "mujoco", "pydantic", "numpy", "h5py"}),
+        (["--help"], {"scipy", "matplotlib", "PIL", "imageio", "jinja2", "mujoco", "numpy", "h5py"}),
         (["schema"], {"scipy", "matplotlib", "PIL", "imageio", "jinja2", "h5py"}),
-        (["scenarios"], {"scipy", "matplotlib", "PIL", "imageio", "jinja2", "mujoco", "pydantic", "h5py"}),
+        (["scenarios"], {"scipy", "matplotlib", "PIL", "imageio", "jinja2", "mujoco", "h5py"}),
     ],
 )
 def test_a_command_loads_only_what_it_needs(arguments: list[str], absent: set[str], tmp_path: Path) -> None:
