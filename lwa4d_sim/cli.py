@@ -174,10 +174,16 @@ def _override(text: str) -> tuple[str, Any]:
 
 
 def _combined(summaries: list[dict[str, Any]], out: Path) -> Path:
+    """One report of several scenarios, and their verdicts side by side on stdout."""
     from lwa4d_sim.report import section_from_folder, write_report
+    from lwa4d_sim.verdict import headline
 
     path = out / "report.html"
-    write_report(path, [section_from_folder(Path(summary["folder"])) for summary in summaries])
+    sections = [section_from_folder(Path(summary["folder"])) for summary in summaries]
+    write_report(path, sections)
+    print("\nside by side")
+    for section in sections:
+        print(f"  {section.title}: {headline(section.runs)}")
     return path
 
 
