@@ -14,6 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from lwa4d_sim.controllers import CustomController
+from lwa4d_sim.metrics import METRICS
 from lwa4d_sim.documents import Path
 from lwa4d_sim.settings import CHOICES, Settings
 
@@ -50,8 +51,30 @@ def fit(document: Any) -> Settings:
 
 
 def json_schema() -> dict[str, Any]:
-    """JSON schema of a scenario's settings, for editors."""
-    return _adapter().json_schema()
+    """JSON schema of a scenario file, for editors.
+
+    A variant's overrides are checked by name only: what they must hold depends on what they are merged into.
+    """
+    schema = _adapter().json_schema()
+    settings: dict[str, Any] = schema["properties"]
+    override = {key: {} for key in settings if key != "name"}
+    variant = {"type": ["object", "null"], "properties": override, "additionalProperties": False}
+    bound = {"type": ["number", "null"]}
+    numbers = {"anyOf": [bound, {"type": "array", "items": bound, "minItems": 1}]}
+    names = "|".join(METRICS)
+    checks = {
+        "type": "object",
+        "properties": {"stable": {"type": "boolean"}},
+        "patternProperties": {f"^({names})_(max|min)$": numbers},
+        "additionalProperties": False,
+    }
+    settings["variants"] = {"type": ["object", "null"], "additionalProperties": variant}
+    settings["expect"] = {"type": ["object", "null"], "additionalProperties": checks}
+    own = schema["$defs"]["CustomController"]
+    del own["properties"]["options"]
+    own["properties"]["kind"]["pattern"] = ":"
+    own["additionalProperties"] = True
+    return {**schema, "required": ["name"]}
 
 
 @cache
