@@ -14,8 +14,8 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from lwa4d_sim.controllers import CustomController
-from lwa4d_sim.metrics import METRICS
 from lwa4d_sim.documents import Path
+from lwa4d_sim.metrics import METRICS
 from lwa4d_sim.settings import CHOICES, Settings
 
 # Beyond this a number in SI units (three years, a hundred thousand tons) is a mistake, and its square may overflow;
@@ -57,7 +57,7 @@ def json_schema() -> dict[str, Any]:
     """
     schema = _adapter().json_schema()
     settings: dict[str, Any] = schema["properties"]
-    override = {key: {} for key in settings if key != "name"}
+    override: dict[str, Any] = {key: {} for key in settings if key != "name"}
     variant = {"type": ["object", "null"], "properties": override, "additionalProperties": False}
     bound = {"type": ["number", "null"]}
     numbers = {"anyOf": [bound, {"type": "array", "items": bound, "minItems": 1}]}
