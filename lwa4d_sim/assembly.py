@@ -80,6 +80,8 @@ def run_together(scenarios: Sequence[Scenario], variant: str, threads: int) -> l
     with about("plant.timestep"):
         timestep = _timestep(first)
     with about("arm"):
+        load_model(first.arm, base=scenario.folder)  # so that what is wrong from here on is wrong with the changes
+    with about("plant"):
         models = [_plant_model(member, scenario.folder) for member in members]
         shared = all(model is models[0] for model in models)
         kinematics = kinematics_for(chain_of(models[0]))
@@ -171,11 +173,11 @@ def _timing(settings: Settings, timestep: Ns, duration: float) -> Timing:
         raise ScenarioError(
             f"{period / NS_PER_S} s is not a whole multiple of the plant step {timestep / NS_PER_S} s; nearest: {whole}"
         )
-    if duration * NS_PER_S / timestep > MAX_STEPS:
+    ticks = -(-to_ns(duration) // period)
+    if ticks * period // timestep > MAX_STEPS:
         raise ScenarioError(
             f"{duration} s at a plant step of {timestep / NS_PER_S} s are more than {MAX_STEPS} steps", key="trajectory"
         )
-    ticks = -(-to_ns(duration) // period)
     if ticks == 0:
         raise ScenarioError("the motion lasts no time at all", key="trajectory")
     phase = 0 if isinstance(loop, IdealLoop) else _phase(loop, period, timestep)

@@ -1,7 +1,4 @@
-"""Kinematics of any serial arm: where the tool is, how it moves, and a numeric inverse.
-
-The arm is a ``Chain``: plain numbers, so nothing here knows where they came from.
-"""
+"""Kinematics of any serial arm, from plain numbers: where the tool is, how it moves, and a numeric inverse."""
 
 from dataclasses import dataclass
 from typing import Literal, NamedTuple

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 
+from lwa4d_sim.errors import ScenarioError
 from lwa4d_sim.interfaces import NS_PER_S, STRICT, Array, Estimator, JointState, Measurement, Ns, Positive
 
 
@@ -265,14 +266,25 @@ class KalmanVelocity:
 
 
 def kalman_gain(period: float, acceleration: float, position: float) -> Array:
-    """Steady-state gain (2,) of the (q, dq) filter, from the discrete Riccati equation (scipy)."""
+    """Steady-state gain (2,) of the (q, dq) filter, from the discrete Riccati equation (scipy).
+
+    Raises:
+        ScenarioError: the two deviations are so far apart that the equation has no numerical solution.
+    """
     from scipy.linalg import solve_discrete_are
 
     A = np.array([[1.0, period], [0.0, 1.0]])
     G = np.array([[0.5 * period**2], [period]])
     C = np.array([[1.0, 0.0]])
-    P = solve_discrete_are(A.T, C.T, acceleration**2 * (G @ G.T), np.array([[position**2]]))
-    gain: Array = (P @ C.T / (C @ P @ C.T + position**2))[:, 0]
+    # only the ratio of the two deviations matters; in units of the position's, nothing over- or underflows
+    try:
+        P = solve_discrete_are(A.T, C.T, (acceleration / position) ** 2 * (G @ G.T), np.eye(1))
+    except np.linalg.LinAlgError as error:
+        raise ScenarioError(
+            f"kalman: acceleration (={acceleration:g}) and position (={position:g}) are too far apart",
+            key="loop.velocity",
+        ) from error
+    gain: Array = (P @ C.T / (C @ P @ C.T + 1.0))[:, 0]
     return gain
 
 

@@ -61,7 +61,6 @@ def metrics(log: "RunLog") -> dict[str, Any]:
     ticks = log.ticks
     joint_error = ticks.q_ref - ticks.q_true
     known = ~np.isnan(ticks.dq).any(axis=1)
-    tail = log.tau[-min(len(log.tau), round(NS_PER_S / log.timestep) + 1) :]
     diverged = log.diverged_at
     values: dict[str, Any] = {
         "stable": diverged is None and since is None,
@@ -75,7 +74,7 @@ def metrics(log: "RunLog") -> dict[str, Any]:
         "rms_joint_error": _per_joint(joint_error**2, np.mean, np.sqrt),
         "velocity_error_rms": _per_joint((ticks.dq - ticks.dq_true)[known] ** 2, np.mean, np.sqrt),
         "peak_torque": _peaks(log.tau),
-        "torque_ripple": _per_joint(tail, np.ptp),
+        "torque_ripple": _per_joint(_last_second(log), np.ptp),
         "peak_speed": _peaks(log.dq),
         "vibration": vibration,
         "saturation_fraction": float(np.mean((log.tau >= log.tau_max) | (log.tau <= -log.tau_max))),
@@ -218,6 +217,16 @@ def _smoothing_kernel(half: int) -> Array:
 
 def _rms(values: Array) -> float:
     return math.sqrt(float(np.mean(values**2)))
+
+
+def _last_second(log: "RunLog") -> Array:
+    """Applied torque in the last second; the ideal loop's rows are the torques of the steps' middles, and are moved."""
+    end = max(1, len(log.tau) - 1)
+    start = max(0, end - round(NS_PER_S / log.timestep))
+    tail: Array = log.tau[start:end]
+    if log.period == log.timestep and start > 0:
+        tail = 0.5 * (tail + log.tau[start - 1 : end - 1])
+    return tail
 
 
 def _peaks(values: Array) -> list[float]:

@@ -94,7 +94,11 @@ def model_path(name_or_path: str, base: Path | None = None) -> Path:
         folder = here / "models" if (here / "models").is_dir() else here.parent / "models"
         return folder / f"{name_or_path}.xml"
     path = (base or Path()) / name_or_path
-    if not path.is_file():
+    try:
+        found = path.is_file()
+    except (OSError, ValueError):  # a name too long, or with a NUL in it
+        found = False
+    if not found:
         raise ModelError(
             f"arm {name_or_path!r}: no such file ({path}); give {', '.join(ARMS)} or the path of an MJCF file"
         )

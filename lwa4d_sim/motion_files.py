@@ -32,6 +32,8 @@ def read_samples(path: Path, joints: int) -> tuple[Array, Array]:
             table, lines = _read_csv(path, joints)
     except OSError as error:
         raise TrajectoryError(f"{path}: cannot be read ({error.strerror})") from error
+    except ValueError as error:  # a name with a NUL in it; what is wrong inside a file is already told
+        raise error if isinstance(error, TrajectoryError) else TrajectoryError(f"{path}: {error}") from error
     derivatives, rest = divmod(table.shape[1] - 1, joints)
     if rest or not 1 <= derivatives <= len(PREFIXES):
         raise TrajectoryError(f"{path}: has {table.shape[1]} columns; valid: {_choices(joints)}")

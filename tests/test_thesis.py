@@ -1,6 +1,7 @@
 """What a run must show: every shipped scenario meets its expectations, and gains turn unstable where theory says."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,37 +26,39 @@ CRITICAL = {
 WAYPOINTS = [[-0.5, -0.3, 0.6], [-0.5, -0.3, 0.05], [0.5, -0.4, 0.05], [0.5, -0.4, 0.6]]
 
 
+# What halving the plant step may change when 0.1 % of a metric is too small to matter: a hundredth of the arm's
+# repeatability (0.15 mm), a quarter of the bus's millidegree, a fifteenth of the finest torque step, one plant step.
+NEGLIGIBLE = {"m": 2e-6, "rad": 4e-6, "rad/s": 1e-4, "N m": 1e-3, "s": 1e-3, "": 1e-9}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("file", SCENARIOS, ids=lambda file: file.stem)
-def test_scenario_meets_its_expectations(file: Path) -> None:
-    summary = run_scenario(Scenario.load(file))
-    assert summary["variants"].keys() == Scenario.load(file).expect.keys(), "every variant says what it expects"
+def test_scenario_meets_its_expectations_at_any_plant_step(file: Path) -> None:
+    """Every variant says what it expects and meets it; half the plant step changes no metric of a stable one."""
+    scenario = Scenario.load(file)
+    summary = run_scenario(scenario)
+    assert summary["variants"].keys() == scenario.expect.keys()
     broken = {
         name: [check for check in variant["expect"]["checks"] if not check["passed"]]
         for name, variant in summary["variants"].items()
     }
     assert not any(broken.values()), broken
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("file", SCENARIOS, ids=lambda file: file.stem)
-def test_half_the_plant_step_changes_nothing(file: Path) -> None:
-    """To 0.1 %, or to what nobody could measure: a micrometre, a microradian, a fifteenth of the finest torque step."""
-    small = {"m": 1e-6, "rad": 1e-6, "rad/s": 1e-4, "N m": 1e-3, "s": 1e-3, "": 1e-9}
-    coarse = measure(run_all(Scenario.load(file)))
     fine = measure(run_all(Scenario.load(file, {"plant.timestep": 0.0005})))
-    for variant, values in coarse.items():
-        others = fine[variant]
-        assert values["stable"] == others["stable"]
-        if not values["stable"]:
-            assert values["unstable_since"] == pytest.approx(others["unstable_since"], abs=0.010)
-            continue
-        for name, value in values.items():
-            if isinstance(value, list):
-                assert [v is None for v in value] == [v is None for v in others[name]]
-            pairs = zip(np.atleast_1d(value), np.atleast_1d(others[name]), strict=True)
-            for a, b in pairs:
-                assert a is b is None or a == pytest.approx(b, rel=1e-3, abs=small[METRICS[name][0]]), (variant, name)
+    for name, variant in summary["variants"].items():
+        compare(variant["metrics"], fine[name])
+
+
+def compare(coarse: dict[str, Any], fine: dict[str, Any]) -> None:
+    """Metrics of one variant at two plant steps; of an unstable one only the onset, to one control period."""
+    assert coarse["stable"] == fine["stable"]
+    if not coarse["stable"]:
+        assert coarse["unstable_since"] == pytest.approx(fine["unstable_since"], abs=0.010)
+        return
+    for name, value in coarse.items():
+        values, others = (v if isinstance(v, list) else [v] for v in (value, fine[name]))
+        assert [v is None for v in values] == [v is None for v in others], name
+        numbers, same = ([v for v in vs if v is not None] for vs in (values, others))
+        assert numbers == pytest.approx(same, rel=1e-3, abs=NEGLIGIBLE[METRICS[name][0]]), name
 
 
 TEXT = """
