@@ -220,12 +220,13 @@ def _rms(values: Array) -> float:
 
 
 def _last_second(log: "RunLog") -> Array:
-    """Applied torque in the last second; the ideal loop's rows are the torques of the steps' middles, and are moved."""
-    end = max(1, len(log.tau) - 1)
+    """Applied torque in the last second; the ideal loop's, which belongs to the steps' middles, moved to their ends."""
+    end = max(1, len(log.tau) - 1)  # the last row only repeats the one before
     start = max(0, end - round(NS_PER_S / log.timestep))
     tail: Array = log.tau[start:end]
     if log.period == log.timestep and start > 0:
-        tail = 0.5 * (tail + log.tau[start - 1 : end - 1])
+        last = 1.5 * log.tau[end - 1] - 0.5 * log.tau[end - 2]
+        tail = np.vstack([0.5 * (tail + log.tau[start - 1 : end - 1]), last])
     return tail
 
 

@@ -1,9 +1,9 @@
 """Reads an MJCF arm, checks that it is one, and applies a scenario's physical changes."""
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -11,12 +11,10 @@ import numpy as np
 from lwa4d_sim.arm import ARMS
 from lwa4d_sim.chain import Chain
 from lwa4d_sim.dynamics import tool_site
+from lwa4d_sim.edits import ArmEdits, Payload
 from lwa4d_sim.errors import ModelError
-from lwa4d_sim.interfaces import STRICT, Array, NonNegative, Positive
+from lwa4d_sim.interfaces import Array
 from lwa4d_sim.mjcf_checks import check_arm, check_damping, name_of, require, torque_ranges
-
-_Vector = tuple[float, float, float]
-_Source = Literal["lwa4d"]  # the drivetrain table of `lwa4d_sim.arm`
 
 _INTEGRATORS = {
     "Euler": mujoco.mjtIntegrator.mjINT_EULER,
@@ -25,59 +23,6 @@ _INTEGRATORS = {
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
     "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class Payload:
-    """A body fixed to the flange.
-
-    Attributes:
-        mass: [kg].
-        com: centre of mass in the flange frame [m].
-        inertia: principal moments about the centre of mass along the flange axes [kg m^2]; default a solid sphere.
-        radius: of that sphere [m].
-    """
-
-    __pydantic_config__: ClassVar[Any] = STRICT
-    mass: NonNegative
-    com: _Vector = (0.0, 0.0, 0.0)
-    inertia: tuple[NonNegative, NonNegative, NonNegative] | None = None
-    radius: Positive = 0.05
-
-
-@dataclass(frozen=True, kw_only=True)
-class Friction:
-    """Joint friction, one number for all joints or one per joint.
-
-    Attributes:
-        viscous: [N m s/rad].
-        coulomb: [N m].
-    """
-
-    __pydantic_config__: ClassVar[Any] = STRICT
-    viscous: NonNegative | tuple[NonNegative, ...] = 0.0
-    coulomb: NonNegative | tuple[NonNegative, ...] = 0.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArmEdits:
-    """Physical changes to an arm; what is None stays as the model file has it.
-
-    Attributes:
-        payload: a body fixed to the flange.
-        mass_scale: factor on mass and inertia of all links, or one per link; the payload is not scaled.
-        armature: reflected rotor inertia [kg m^2], one number or one per joint; "lwa4d" takes the table in
-            `lwa4d_sim.arm` (shipped arms only).
-        friction: joint friction in place of the model's; "lwa4d" as above.
-        gravity: [m/s^2] in base axes.
-    """
-
-    __pydantic_config__: ClassVar[Any] = STRICT
-    payload: Payload | None = None
-    mass_scale: Positive | tuple[Positive, ...] = 1.0
-    armature: NonNegative | tuple[NonNegative, ...] | _Source | None = None
-    friction: Friction | _Source | None = None
-    gravity: _Vector | None = None
 
 
 _AS_IT_IS = ArmEdits()

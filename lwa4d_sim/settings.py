@@ -13,9 +13,9 @@ from lwa4d_sim.channels import Transport
 from lwa4d_sim.controllers import ControllerParameters
 from lwa4d_sim.delays import Latency, Loss
 from lwa4d_sim.drives import LateData
+from lwa4d_sim.edits import ArmEdits
 from lwa4d_sim.estimators import FilteredDerivative, VelocityParameters
 from lwa4d_sim.interfaces import STRICT, NonNegative, Positive
-from lwa4d_sim.mjcf import ArmEdits
 from lwa4d_sim.plant import Disturbance
 from lwa4d_sim.trajectories import FourierMotion, SampledMotion, WaypointMotion
 

@@ -9,10 +9,11 @@ import pytest
 
 from lwa4d_sim.arm import ARMS, load_arm
 from lwa4d_sim.dynamics import ClosedForm3, Dynamics, NominalModel
+from lwa4d_sim.edits import ArmEdits, Payload
 from lwa4d_sim.errors import ModelError
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.kinematics import kinematics_for
-from lwa4d_sim.mjcf import ArmEdits, Payload, chain_of, load_model
+from lwa4d_sim.mjcf import chain_of, load_model
 
 MODELS = Path(__file__).parents[1] / "models"
 N = 40

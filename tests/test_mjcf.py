@@ -9,9 +9,10 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from lwa4d_sim.arm import ARMS, GRAVITY
+from lwa4d_sim.edits import ArmEdits, Friction, Payload
 from lwa4d_sim.errors import ModelError
 from lwa4d_sim.interfaces import Array
-from lwa4d_sim.mjcf import ArmEdits, Friction, Payload, chain_of, home, load_model, model_path, torque_limits
+from lwa4d_sim.mjcf import chain_of, home, load_model, model_path, torque_limits
 
 # A foreign arm with everything the shipped ones lack: masses from geoms, a frame, fixed bodies between and behind the
 # links, an anchor off the origin, a slide, a tilted inertial frame, a joint reference, no limits, contacts.

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from lwa4d_sim.dynamics import ClosedForm3, NominalModel
+from lwa4d_sim.edits import ArmEdits
 from lwa4d_sim.errors import ModelError, ScenarioError
 from lwa4d_sim.interfaces import Array
-from lwa4d_sim.mjcf import ArmEdits, load_model
+from lwa4d_sim.mjcf import load_model
 from lwa4d_sim.plant import SPEED_LIMIT, Disturbance, Plant
 from lwa4d_sim.record import RunLog
 from lwa4d_sim.runner import run, run_batch

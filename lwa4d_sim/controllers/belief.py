@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Literal
 
 from lwa4d_sim.dynamics import ClosedForm3, NominalModel
+from lwa4d_sim.edits import ArmEdits
 from lwa4d_sim.errors import ScenarioError
 from lwa4d_sim.interfaces import ArmModel
-from lwa4d_sim.mjcf import ArmEdits, load_model
+from lwa4d_sim.mjcf import load_model
 
 
 @dataclass(frozen=True, kw_only=True)
