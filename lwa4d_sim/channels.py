@@ -33,7 +33,8 @@ class DirectChannel:
             item = self._queue.popleft()
         if item is not None:
             # one instant for all: (1, 1) costs a tenth of the full shape
-            self._newest = Arrived(np.array([[item[1]]]), np.array([[item[0]]]), item[2])
+            stamp = np.array([[item[1]]])
+            self._newest = Arrived(stamp, stamp if item[0] == item[1] else np.array([[item[0]]]), item[2])
         return self._newest
 
     def changes(self, after: Ns, before: Ns) -> list[Ns]:

@@ -51,6 +51,7 @@ class FilterSource:
         self._dt = timestep
         # rows: y1, y2, q and dq before the stretch, then q and dq at each of its steps
         self._rows = np.stack([q0, q0, q0, np.zeros_like(q0)], axis=1)
+        self._speed = np.zeros_like(q0)
 
     def observe(self, q: Array, dq: Array) -> None:
         steps = q.shape[1]
@@ -59,17 +60,17 @@ class FilterSource:
             self._rows = np.concatenate([self._rows[:, :4], blank], axis=1)
         rows = self._rows
         rows[:, 4 : 4 + steps], rows[:, 4 + steps :] = q, dq
-        rows[:, :2] = np.matmul(_filter_weights(steps, self._dt, self._T), rows)
+        out = np.matmul(_filter_weights(steps, self._dt, self._T), rows)
+        rows[:, :2], self._speed = out[:, :2], out[:, 2]
         rows[:, 2], rows[:, 3] = q[:, -1], dq[:, -1]
 
     def read(self) -> Array:
-        speed: Array = (self._rows[:, 0] - self._rows[:, 1]) / self._T
-        return speed
+        return self._speed
 
 
 @lru_cache(maxsize=64)
 def _filter_weights(steps: int, dt: float, T: float) -> Array:
-    """The filter over ``steps`` plant steps as one linear map (2, 4 + 2 steps), from `FilterSource`'s rows to (y1, y2).
+    """The filter over ``steps`` plant steps as one linear map, from `FilterSource`'s rows to y1, y2 and the speed.
 
     Convolutions of the cubic Hermite basis with the impulse responses e^(-s/T)/T and s e^(-s/T)/T^2, by Gauss-Legendre
     quadrature: 32 nodes a step are exact to rounding up to dt = 10 T.
@@ -85,7 +86,8 @@ def _filter_weights(steps: int, dt: float, T: float) -> Array:
             samples[:, signal, at] += impulses @ basis
     decay = np.exp(-steps * dt / T)
     state = np.array([[decay, 0.0], [steps * dt / T * decay, decay]])
-    return np.hstack([state, samples[:, :, 0], samples[:, 0, 1:], samples[:, 1, 1:]])
+    y = np.hstack([state, samples[:, :, 0], samples[:, 0, 1:], samples[:, 1, 1:]])
+    return np.vstack([y, (y[0] - y[1]) / T])
 
 
 class PassThrough:

@@ -69,7 +69,7 @@ class Plant:
         self._disturbances = [_Window.of(disturbance, model, self.timestep) for disturbance in disturbances]
         self._edges = sorted({edge for window in self._disturbances for edge in (window.first, window.last)})
         self._step = 0
-        self._records: dict[int, dict[int, Array]] = {}
+        self._records: dict[int, tuple[Array, Array, dict[int, Array]]] = {}
         self._given_up: Any = None
         self.running = np.ones(len(q0), bool)
         self._all_running = True
@@ -88,7 +88,8 @@ class Plant:
             q and dq (N, steps, n) after each step. The arrays are reused by the next call.
         """
         edges = [edge - self._step for edge in self._edges if self._step < edge < self._step + steps]
-        self._apply_wrenches()
+        if self._disturbances:
+            self._apply_wrenches()
         if not edges:
             out = self._span(tau, steps)
             self._step += steps
@@ -107,14 +108,16 @@ class Plant:
 
     def diverged(self) -> Any:
         """Mask (N,) of arms found to have left all bounds since the last call, or None; they stand still from then."""
-        # What the engine warns of is not finite, and what is not finite is not below the limit. The ufunc's own reduce
-        # costs half of max(); this runs at every tick.
-        if self._given_up is None and np.maximum.reduce(np.abs(self.dq), axis=None) < SPEED_LIMIT:
+        # What the engine warns of is not finite, and what is not finite is not below the limit. One sum of squares is
+        # the cheapest look at all speeds; this runs at every tick.
+        if self._given_up is None and np.vdot(self.dq, self.dq) < SPEED_LIMIT**2:
             return None
         lost = ~(np.abs(self.dq).max(axis=1) < SPEED_LIMIT) | self._warnings.any(axis=1)
         if self._given_up is not None:
             lost |= self._given_up
         lost &= self.running
+        if not lost.any():
+            return None
         self.running &= ~lost
         self._all_running = bool(self.running.all())
         self.q[lost], self.dq[lost] = 0.0, 0.0
@@ -122,12 +125,12 @@ class Plant:
 
     def _span(self, tau: Array | None, steps: int) -> tuple[Array, Array]:
         """Steps without a change of wrench."""
-        q, dq = self._buffers(steps)
+        q, dq, out = self._buffers(steps)
         if tau is None:
             self._brake(np.flatnonzero(self.running), 0, q, dq)
             return q, dq
         # a sum is the cheapest look for a NaN among few numbers
-        if not self._all_running or math.isnan(tau.sum()):
+        if not self._all_running or math.isnan(np.add.reduce(tau, axis=None)):
             self._mixed(np.broadcast_to(tau, (len(tau), steps, tau.shape[2])), q, dq)
         elif tau.shape[1] == 1:
             self._ctrl[:] = tau[:, 0]
@@ -135,9 +138,9 @@ class Plant:
                 self._batch.step()
                 q[:, 0], dq[:, 0] = self.q, self.dq
             else:
-                self._batch.rollout(steps, record=(_MOTION,), out=self._records[steps])
+                self._batch.rollout(steps, record=(_MOTION,), out=out)
         else:
-            self._batch.rollout(steps, tau, record=(_MOTION,), out=self._records[steps])
+            self._batch.rollout(steps, tau, record=(_MOTION,), out=out)
         return q, dq
 
     def _mixed(self, tau: Array, q: Array, dq: Array) -> None:
@@ -165,15 +168,15 @@ class Plant:
         q[ids, start:] = self.q[ids][:, None]
         dq[ids, start:] = 0.0
 
-    def _buffers(self, steps: int) -> tuple[Array, Array]:
+    def _buffers(self, steps: int) -> tuple[Array, Array, dict[int, Array]]:
+        """Views of q and dq in what the batch records into, and that."""
         if steps not in self._records:
-            self._records[steps] = {_MOTION: np.zeros((self.q.shape[0], steps, 2 * self.q.shape[1]))}
-        record = self._records[steps][_MOTION]
-        return record[:, :, : self.q.shape[1]], record[:, :, self.q.shape[1] :]
+            n_sims, n = self.q.shape
+            record = np.zeros((n_sims, steps, 2 * n))
+            self._records[steps] = record[:, :, :n], record[:, :, n:], {_MOTION: record}
+        return self._records[steps]
 
     def _apply_wrenches(self) -> None:
-        if not self._disturbances:
-            return
         self._wrench[:] = 0.0
         for window in self._disturbances:
             if window.first <= self._step < window.last:

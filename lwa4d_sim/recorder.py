@@ -51,7 +51,7 @@ class _Seen:
         if tick.state is None or tick.command is None or tick.age is None:
             return
         self.q[:, k], self.dq[:, k], self.tau[:, k] = tick.state.q, tick.state.dq, tick.command
-        self.age[:, k] = tick.age.max(axis=1)
+        self.age[:, k] = tick.age[:, 0] if tick.age.shape[1] == 1 else tick.age.max(axis=1)
 
     def log(self, i: int, q: Array, dq: Array, t: Array, trajectory: Trajectory, *, exact: bool) -> TickLog:
         """Of simulation ``i``, with the arm's own q and dq at the ticks; ``exact``: the controller saw just those."""
@@ -117,7 +117,8 @@ def record(
         events = _events(braked_steps, diverged, timestep)
         tau[i, :stop][braked_steps] = 0.0
         first, step = timing.phase // timestep, stride * per_tick
-        at = np.arange(first, stop, step)[: seen.count]
+        at = slice(first, min(stop, first + step * seen.count), step)
+        t = np.arange(at.start, at.stop, step) * (timestep / NS_PER_S)
         logs.append(
             RunLog(
                 name=info.name,
@@ -127,9 +128,7 @@ def record(
                 q=q[i, :stop],
                 dq=dq[i, :stop],
                 tau=tau[i, :stop],
-                ticks=seen.log(
-                    i, q[i, at], dq[i, at], at * (timestep / NS_PER_S), info.trajectory, exact=not full_ticks
-                ),
+                ticks=seen.log(i, q[i, at], dq[i, at], t, info.trajectory, exact=not full_ticks),
                 knots=info.trajectory.knots,
                 tau_max=info.tau_max,
                 seed=info.seed,

@@ -62,7 +62,7 @@ class ReferenceBlocks:
         self._period, self._offset, self._ticks = period / NS_PER_S, offset, ticks
         self._type: Any = JointReference if space == "joint" else TaskReference
         self._start = -_BLOCK
-        self._columns: list[Array | None] = []
+        self._block: list[Any] = []
 
     def at(self, k: int) -> Any:
         """Reference of tick ``k``; fields have leading axis N, or 1 when all simulations share the motion."""
@@ -70,7 +70,7 @@ class ReferenceBlocks:
         if not 0 <= i < _BLOCK:
             self._sample(k)
             i = 0
-        return self._type(*[None if column is None else column[i] for column in self._columns])
+        return self._block[i]
 
     def _sample(self, k: int) -> None:
         t = np.arange(k, min(k + _BLOCK, self._ticks)) * self._period + self._offset
@@ -78,7 +78,7 @@ class ReferenceBlocks:
             trajectory.joint(t) if self._space == "joint" else trajectory.task(t) for trajectory in self._trajectories
         ]
         self._start = k
-        self._columns = []
-        for name in self._type._fields:
-            parts = [getattr(one, name) for one in sampled]
-            self._columns.append(None if parts[0] is None else np.stack(parts, axis=1))
+        columns = [
+            [None] * len(t) if part[0] is None else np.stack(part, axis=1) for part in zip(*sampled, strict=True)
+        ]
+        self._block = [self._type(*row) for row in zip(*columns, strict=True)]
