@@ -1,4 +1,4 @@
-"""The speed and memory table of docs/benchmarks.md: ratios within one run, medians of interleaved repeats.
+"""The speed and memory table of docs/benchmarks.md: ratios within one run, medians of interleaved pairs.
 
 Run with `make bench`, or `python -m benchmarks [NAME...]`.
 """
@@ -10,7 +10,6 @@ import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
-from statistics import median
 
 import mujoco
 import numpy as np
@@ -59,26 +58,29 @@ def start() -> np.ndarray:
 def ratio(
     subject: Callable[[], None], against: Callable[[], None], repeats: int, *, warm_up: bool = True
 ) -> tuple[float, float]:
-    """Median time of ``subject`` over the median time of ``against``, interleaved, and the latter [s]."""
-    times: tuple[list[float], list[float]] = ([], [])
+    """Median over interleaved pairs of the time of ``subject`` over that of ``against``, and the latter's median [s].
+
+    Pairs, because a busy computer changes its speed from second to second but seldom between two neighbours.
+    """
+    times = np.empty((repeats, 2))
     for function in (subject, against) if warm_up else ():
         function()
-    for _ in range(repeats):
-        for function, into in zip((subject, against), times, strict=True):
+    for pair in times:
+        for k, function in enumerate((subject, against)):
             begin = time.perf_counter()
             function()
-            into.append(time.perf_counter() - begin)
-    return median(times[0]) / median(times[1]), median(times[1])
+            pair[k] = time.perf_counter() - begin
+    return float(np.median(times[:, 0] / times[:, 1])), float(np.median(times[:, 1]))
 
 
 def sampled() -> tuple[float, float]:
     model, one = load_model("lwa4d_7dof", timestep=0.001, integrator="RK4"), scenario()
-    return ratio(lambda: void(run(one, "can")), raw(model, torques()), 7)
+    return ratio(lambda: void(run(one, "can")), raw(model, torques()), 25)
 
 
 def ideal() -> tuple[float, float]:
     model, one = load_model("lwa4d_7dof", timestep=0.001, integrator="RK4"), scenario()
-    return ratio(lambda: void(run(one, "ideal")), raw(model, torques()), 5)
+    return ratio(lambda: void(run(one, "ideal")), raw(model, torques()), 9)
 
 
 def batch_1024() -> tuple[float, float]:
@@ -103,7 +105,7 @@ def batch_1024() -> tuple[float, float]:
         qpos[:], qvel[:] = start(), 0.0
         batch.rollout(steps, control, record=("qpos",))
 
-    return ratio(ours, limit, 1, warm_up=False)
+    return ratio(ours, limit, 3, warm_up=False)
 
 
 def command() -> tuple[float, float]:
@@ -120,7 +122,7 @@ def command() -> tuple[float, float]:
             subprocess.run(imports, check=True)
             step()
 
-        return ratio(lambda: void(subprocess.run(ours, check=True, capture_output=True)), floor, 7)
+        return ratio(lambda: void(subprocess.run(ours, check=True, capture_output=True)), floor, 9)
 
 
 def memory() -> tuple[float, float]:
