@@ -59,6 +59,7 @@ def metrics(log: "RunLog") -> dict[str, Any]:
         for goal, (_, end) in zip(goals, _segments(log), strict=True)
     ]
     ticks = log.ticks
+    peak = _peaks(log.tau)
     joint_error = ticks.q_ref - ticks.q_true
     known = ~np.isnan(ticks.dq).any(axis=1)
     diverged = log.diverged_at
@@ -73,11 +74,11 @@ def metrics(log: "RunLog") -> dict[str, Any]:
         "max_joint_error": _per_joint(np.abs(joint_error), np.max),
         "rms_joint_error": _per_joint(joint_error**2, np.mean, np.sqrt),
         "velocity_error_rms": _per_joint((ticks.dq - ticks.dq_true)[known] ** 2, np.mean, np.sqrt),
-        "peak_torque": _peaks(log.tau),
+        "peak_torque": peak,
         "torque_ripple": _per_joint(_last_second(log), np.ptp),
         "peak_speed": _peaks(log.dq),
         "vibration": vibration,
-        "saturation_fraction": float(np.mean((log.tau >= log.tau_max) | (log.tau <= -log.tau_max))),
+        "saturation_fraction": _saturation(log, peak),
         "data_age_max": _largest(ticks.age),
     }
     return {key: _finite(value) for key, value in values.items()}
@@ -217,6 +218,13 @@ def _smoothing_kernel(half: int) -> Array:
 
 def _rms(values: Array) -> float:
     return math.sqrt(float(np.mean(values**2)))
+
+
+def _saturation(log: "RunLog", peak: list[float]) -> float:
+    """Share of joint-steps at the torque limit; most runs never reach it, and need no second look at every step."""
+    if (np.asarray(peak) < log.tau_max).all():
+        return 0.0
+    return float(np.mean((log.tau >= log.tau_max) | (log.tau <= -log.tau_max)))
 
 
 def _last_second(log: "RunLog") -> Array:

@@ -16,8 +16,8 @@ from lwa4d_sim.interfaces import STRICT, Array, NonNegative, Positive, to_ns
 SPEED_LIMIT = 1000.0  # [rad/s]
 
 _Vector = tuple[float, float, float]
-# What is recorded of each step, in one piece: q, then dq.
-_MOTION = int(mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL)
+# What is recorded of each step: as state components, for the batch looks up fields by name more slowly.
+_Q, _DQ = int(mujoco.mjtState.mjSTATE_QPOS), int(mujoco.mjtState.mjSTATE_QVEL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,9 +138,9 @@ class Plant:
                 self._batch.step()
                 q[:, 0], dq[:, 0] = self.q, self.dq
             else:
-                self._batch.rollout(steps, record=(_MOTION,), out=out)
+                self._batch.rollout(steps, record=(_Q, _DQ), out=out)
         else:
-            self._batch.rollout(steps, tau, record=(_MOTION,), out=out)
+            self._batch.rollout(steps, tau, record=(_Q, _DQ), out=out)
         return q, dq
 
     def _mixed(self, tau: Array, q: Array, dq: Array) -> None:
@@ -156,9 +156,8 @@ class Plant:
                 self._brake(np.flatnonzero(held), start, q[:, :end], dq[:, :end])
             if free.any():
                 ids = np.flatnonzero(free)
-                out = self._batch.rollout(end - start, tau[ids, start:end], record=(_MOTION,), ids=ids)[_MOTION]
-                n = self.q.shape[1]
-                q[ids, start:end], dq[ids, start:end] = out[:, :, :n], out[:, :, n:]
+                out = self._batch.rollout(end - start, tau[ids, start:end], record=(_Q, _DQ), ids=ids)
+                q[ids, start:end], dq[ids, start:end] = out[_Q], out[_DQ]
             lost = ~self.running
             q[lost, start:end], dq[lost, start:end] = self.q[lost][:, None], 0.0
             start = end
@@ -169,11 +168,11 @@ class Plant:
         dq[ids, start:] = 0.0
 
     def _buffers(self, steps: int) -> tuple[Array, Array, dict[int, Array]]:
-        """Views of q and dq in what the batch records into, and that."""
+        """Arrays for q and dq, and the same as the batch wants them."""
         if steps not in self._records:
             n_sims, n = self.q.shape
-            record = np.zeros((n_sims, steps, 2 * n))
-            self._records[steps] = record[:, :, :n], record[:, :, n:], {_MOTION: record}
+            q, dq = np.zeros((n_sims, steps, n)), np.zeros((n_sims, steps, n))
+            self._records[steps] = q, dq, {_Q: q, _DQ: dq}
         return self._records[steps]
 
     def _apply_wrenches(self) -> None:

@@ -186,7 +186,7 @@ class ComputedPaths:
 
     def x(self, q: Array) -> Array:
         """Tool points (T, 3) [m]."""
-        return in_blocks(self.kinematics.point, q)
+        return in_blocks(self.kinematics.point, q, 1500)
 
     def x_ref(self, t: Array) -> Array:
         """Desired tool points (T, 3) [m]."""

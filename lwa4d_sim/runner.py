@@ -9,9 +9,9 @@ from lwa4d_sim.metrics import deviation
 from lwa4d_sim.record import RunLog
 from lwa4d_sim.scenario import Scenario
 
-# Runs stepped together share this much memory for their records (assumed: what any machine can spare; 76 runs of 20 s,
+# Runs stepped together share this much memory for their records (assumed: what any machine can spare; 230 runs of 20 s,
 # 7 joints and 1 ms). Few runs would waste threads, so there are never fewer than the second number.
-RECORD_BUDGET, LEAST_CHUNK = 256_000_000, 16
+RECORD_BUDGET, LEAST_CHUNK = 768_000_000, 16
 
 
 def run(scenario: Scenario, variant: str | None = None) -> RunLog:
