@@ -61,8 +61,7 @@ class FilterSource:
         rows = self._rows
         rows[:, 4 : 4 + steps], rows[:, 4 + steps :] = q, dq
         out = np.matmul(_filter_weights(steps, self._dt, self._T), rows)
-        rows[:, :2], self._speed = out[:, :2], out[:, 2]
-        rows[:, 2], rows[:, 3] = q[:, -1], dq[:, -1]
+        rows[:, :4], self._speed = out[:, :4], out[:, 4]
 
     def read(self) -> Array:
         return self._speed
@@ -70,7 +69,7 @@ class FilterSource:
 
 @lru_cache(maxsize=64)
 def _filter_weights(steps: int, dt: float, T: float) -> Array:
-    """The filter over ``steps`` plant steps as one linear map, from `FilterSource`'s rows to y1, y2 and the speed.
+    """The filter over ``steps`` plant steps as one linear map of `FilterSource`'s rows: to their first four, then the speed.
 
     Convolutions of the cubic Hermite basis with the impulse responses e^(-s/T)/T and s e^(-s/T)/T^2, by Gauss-Legendre
     quadrature: 32 nodes a step are exact to rounding up to dt = 10 T.
@@ -87,7 +86,9 @@ def _filter_weights(steps: int, dt: float, T: float) -> Array:
     decay = np.exp(-steps * dt / T)
     state = np.array([[decay, 0.0], [steps * dt / T * decay, decay]])
     y = np.hstack([state, samples[:, :, 0], samples[:, 0, 1:], samples[:, 1, 1:]])
-    return np.vstack([y, (y[0] - y[1]) / T])
+    last = np.zeros((2, y.shape[1]))
+    last[0, 3 + steps] = last[1, -1] = 1.0  # the last q and dq are the next stretch's first
+    return np.vstack([y, last, (y[0] - y[1]) / T])
 
 
 class PassThrough:
