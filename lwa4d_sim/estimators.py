@@ -69,7 +69,7 @@ class FilterSource:
 
 @lru_cache(maxsize=64)
 def _filter_weights(steps: int, dt: float, T: float) -> Array:
-    """The filter over ``steps`` plant steps as one linear map of `FilterSource`'s rows: to their first four, then the speed.
+    """The filter over ``steps`` plant steps as one linear map: `FilterSource`'s rows to their first four and the speed.
 
     Convolutions of the cubic Hermite basis with the impulse responses e^(-s/T)/T and s e^(-s/T)/T^2, by Gauss-Legendre
     quadrature: 32 nodes a step are exact to rounding up to dt = 10 T.
