@@ -148,7 +148,7 @@ def vibrations(log: "RunLog") -> tuple[list[float | None], float | None]:
     of less than a second has none that could be told from motion. A segment is unstable when, in its last second (or
     quarter), the vibration is above the floor, a good share of the speed, and has not decayed against the stretch
     before, or is above the limit anyway. The onset is the start of the stretch in which the running rms stays above the
-    floor; where a run diverges, of the stretch in which some joint is too fast for any drive.
+    floor; where a run diverges too soon for that, of the stretch in which some joint is too fast for any drive.
     """
     # half a control period resolves every frequency a sampled loop can have; the ideal loop has none of its own
     finest = log.period // 2 if log.period > log.timestep else _COARSE
@@ -164,7 +164,10 @@ def vibrations(log: "RunLog") -> tuple[list[float | None], float | None]:
         if end >= len(log.dq):
             values.append(None)
             if since is None and log.diverged_at is not None and start < len(log.dq):
-                since = _runaway(log, start)
+                # as in a whole segment, so that it does not matter whether a shaking run just stays within bounds
+                a, b = start // stride, len(power) - half
+                k = _onset(power[a:b], b - a, h) if b > half else None
+                since = (a + k) * h if k is not None else _runaway(log, start)
             continue
         # the fit looks half a window ahead and must not see the next segment's jump
         a, b = start // stride, end // stride - half
@@ -180,7 +183,7 @@ def vibrations(log: "RunLog") -> tuple[list[float | None], float | None]:
         lasting = (now > VIBRATION_FLOOR) & (now > VIBRATION_SHARE * speed) & (now > DECAY * before)
         shaking = lasting | (now > VIBRATION_LIMIT)
         if shaking.any() and since is None:
-            since = (a + _onset(power[a:b], window, h)) * h
+            since = (a + (_onset(power[a:b], window, h) or 0)) * h
     return values, since
 
 
@@ -190,12 +193,15 @@ def _runaway(log: "RunLog", start: int) -> float:
     return (start + (int(slow[-1]) + 1 if slow.size else 0)) * log.timestep / NS_PER_S
 
 
-def _onset(power: Array, window: int, h: float) -> int:
-    """First index after which the running mean of ``power`` stays above the floor to the end of the segment."""
+def _onset(power: Array, window: int, h: float) -> int | None:
+    """First index after which the running mean of ``power`` stays above the floor to the end; None if it does not."""
     width = max(1, min(round(0.2 / h), window))
+    if len(power) < width:
+        return None
     running = np.convolve(power, np.full(width, 1.0 / width), mode="valid")
     below = np.flatnonzero(running < VIBRATION_FLOOR**2)
-    return int(below[-1]) + 1 if below.size else 0
+    first = int(below[-1]) + 1 if below.size else 0
+    return first if first < len(running) else None
 
 
 def vibrating(signal: Array, half: int) -> Array:
