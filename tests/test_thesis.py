@@ -111,5 +111,5 @@ def test_thesis_case_numbers() -> None:
     values = measure(logs)["can"]
     assert max(values["torque_ripple"]) == pytest.approx(62.0, abs=1.0)
     last_second = logs["can"].dq[-1000:]
-    assert np.abs(last_second).max() == pytest.approx(12.0, abs=7.0)
+    assert np.abs(last_second).max() == pytest.approx(12.0, abs=0.5)
     assert logs["can"].x[0] == pytest.approx([0.0, -0.397, 0.628], abs=1e-12)
