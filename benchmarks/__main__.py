@@ -55,15 +55,13 @@ def start() -> np.ndarray:
     return np.asarray(scenario().variants["can"].initial.q)
 
 
-def ratio(
-    subject: Callable[[], None], against: Callable[[], None], repeats: int, *, warm_up: bool = True
-) -> tuple[float, float]:
+def ratio(subject: Callable[[], None], against: Callable[[], None], repeats: int) -> tuple[float, float]:
     """Median over interleaved pairs of the time of ``subject`` over that of ``against``, and the latter's median [s].
 
     Pairs, because a busy computer changes its speed from second to second but seldom between two neighbours.
     """
     times = np.empty((repeats, 2))
-    for function in (subject, against) if warm_up else ():
+    for function in (subject, against):
         function()
     for pair in times:
         for k, function in enumerate((subject, against)):
@@ -105,7 +103,7 @@ def batch_1024() -> tuple[float, float]:
         qpos[:], qvel[:] = start(), 0.0
         batch.rollout(steps, control, record=("qpos",))
 
-    return ratio(ours, limit, 3, warm_up=False)
+    return ratio(ours, limit, 3)
 
 
 def command() -> tuple[float, float]:

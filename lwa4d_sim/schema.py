@@ -43,7 +43,7 @@ def fit(document: Any) -> Settings:
         Misfit: with the first thing wrong, from the top down.
     """
     reading = _Reading()
-    resolved = reading.resolve([Settings], document, ())
+    resolved = reading.resolve((Settings,), document, ())
     try:
         return _adapter().validate_json(json.dumps(resolved), strict=True)
     except ValidationError as error:
@@ -89,14 +89,15 @@ def _fields(cls: Any) -> dict[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
-def _members(annotation: Any, rules: tuple[Any, ...] = ()) -> list[Any]:
+@cache
+def _members(annotation: Any, rules: tuple[Any, ...] = ()) -> tuple[Any, ...]:
     """The types a value may have, unions opened; a type with rules stays wrapped in Annotated."""
     if typing.get_origin(annotation) is typing.Annotated:
         inner, *more = typing.get_args(annotation)
         return _members(inner, (*rules, *more))
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
-        return [member for part in typing.get_args(annotation) for member in _members(part, rules)]
-    return [typing.Annotated[annotation, *rules] if rules else annotation]
+        return tuple(member for part in typing.get_args(annotation) for member in _members(part, rules))
+    return (typing.Annotated[annotation, *rules] if rules else annotation,)
 
 
 def _bare(member: Any) -> Any:
@@ -107,20 +108,23 @@ def _rules(member: Any) -> tuple[Any, ...]:
     return typing.get_args(member)[1:] if typing.get_origin(member) is typing.Annotated else ()
 
 
-def _items(members: Sequence[Any], i: int) -> list[Any]:
+@cache
+def _items(members: tuple[Any, ...], i: int) -> tuple[Any, ...]:
     """What the item ``i`` of a list may be."""
     tuples = [typing.get_args(_bare(m)) for m in members if typing.get_origin(_bare(m)) is tuple]
-    return [inner for args in tuples for inner in _members(args[0 if args[-1] is Ellipsis else min(i, len(args) - 1)])]
+    return tuple(
+        inner for args in tuples for inner in _members(args[0 if args[-1] is Ellipsis else min(i, len(args) - 1)])
+    )
 
 
 class _Reading:
     """What each place of one document may hold, and which class each of its mappings means."""
 
     def __init__(self) -> None:
-        self._valid: dict[Path, list[Any]] = {}
+        self._valid: dict[Path, tuple[Any, ...]] = {}
         self._chosen: dict[Path, str] = {}
 
-    def resolve(self, members: list[Any], node: Any, path: Path) -> Any:
+    def resolve(self, members: tuple[Any, ...], node: Any, path: Path) -> Any:
         """``node`` with left-out kinds filled in."""
         self._valid[path] = members
         if isinstance(node, Mapping):

@@ -618,7 +618,7 @@ def parameter_classes() -> dict[Any, None]:
             found[cls] = None
             for annotation in _fields(cls).values():
                 waiting += _members(annotation)
-        waiting += _items([member], 0)
+        waiting += _items((member,), 0)
     return found
 
 

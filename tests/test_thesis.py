@@ -26,9 +26,9 @@ CRITICAL = {
 WAYPOINTS = [[-0.5, -0.3, 0.6], [-0.5, -0.3, 0.05], [0.5, -0.4, 0.05], [0.5, -0.4, 0.6]]
 
 
-# What halving the plant step may change when 0.1 % of a metric is too small to matter: a hundredth of the arm's
-# repeatability (0.15 mm), a quarter of the bus's millidegree, a fifteenth of the finest torque step, one plant step.
-NEGLIGIBLE = {"m": 2e-6, "rad": 4e-6, "rad/s": 1e-4, "N m": 1e-3, "s": 1e-3, "": 1e-9}
+# A metric that is zero but for the integration (the ideal computed torque's errors) has no relative change. Too small
+# to matter: a tenth of the bus's millidegree, what that makes at one metre of reach, and as little of speed and torque.
+NEGLIGIBLE = {"m": 1e-6, "rad": 1.7e-6, "rad/s": 1e-6, "N m": 1e-6, "s": 0.0, "": 0.0}
 
 
 @pytest.mark.slow
