@@ -12,6 +12,10 @@ from mujoco.batch import Batch
 from lwa4d_sim.errors import ModelError
 from lwa4d_sim.interfaces import STRICT, Array, NonNegative, Positive, to_ns
 
+# Inertia [kg m^2] of a joint whose own brake is closed (assumed: 1e5 times the arm's). The joint moves 1e-8 rad in 10 ms
+# under the arm's weight, which is taken back, and the others feel it as part of the link before to one part in 1e5.
+BRAKED_INERTIA = 1e6
+
 # A joint this fast is no arm any more (assumed: about a thousand times the fastest joint of the LWA4D).
 SPEED_LIMIT = 1000.0  # [rad/s]
 
@@ -71,6 +75,8 @@ class Plant:
         self._step = 0
         self._records: dict[int, tuple[Array, Array, dict[int, Array]]] = {}
         self._given_up: Any = None
+        self._held: tuple[Any, Array] | None = None
+        self._armature = np.array(model.dof_armature)
         self.running = np.ones(len(q0), bool)
         self._all_running = True
         self.q[:] = q0
@@ -101,6 +107,18 @@ class Plant:
             self._step += end - start
             self._apply_wrenches()
         return np.concatenate([p[0] for p in pieces], axis=1), np.concatenate([p[1] for p in pieces], axis=1)
+
+    def hold(self, joints: Any) -> None:
+        """Close the brakes of the joints in a mask (n,), of all arms, and open all others; the rest goes on moving.
+
+        An ideal brake: the joint stands still at once (assumed). For plants built from one model.
+        """
+        # The other joints must feel a held one through its link, which setting it back alone would not do: each step
+        # computes their acceleration. So the joint gets an inertia that nothing can move.
+        self._batch.expand("dof_armature")[:] = np.where(joints, BRAKED_INERTIA, self._armature)
+        held = np.flatnonzero(joints)
+        self.dq[:, held] = 0.0
+        self._held = (held, self.q[:, held].copy()) if held.size else None
 
     def give_up(self, arms: Any) -> None:
         """Count the arms of a mask (N,) as lost, whatever their state."""
@@ -141,6 +159,10 @@ class Plant:
                 self._batch.rollout(steps, record=(_Q, _DQ), out=out)
         else:
             self._batch.rollout(steps, tau, record=(_Q, _DQ), out=out)
+        if self._held is not None:
+            joints, where = self._held
+            q[:, :, joints], dq[:, :, joints] = where[:, None], 0.0
+            self.q[:, joints], self.dq[:, joints] = where, 0.0
         return q, dq
 
     def _mixed(self, tau: Array, q: Array, dq: Array) -> None:

@@ -322,3 +322,26 @@ def test_a_torque_that_is_no_number_is_no_closed_brake(tmp_path: Path, monkeypat
 def test_a_batch_refuses_to_mix_what_its_members_share(change: dict[str, Any]) -> None:
     with pytest.raises(ScenarioError, match="member 1 of the batch differs in"):
         list(run_batch(scenario(), [{}, change]))
+
+
+def test_single_brakes_make_the_seven_joint_arm_the_three_joint_arm() -> None:
+    """The others feel a held joint as part of its link, and a released one moves on from where it stood."""
+    free, held = [0, 1, 3], np.array([False, False, True, False, True, True, True])
+    q3 = np.array([[0.3, -1.1, 0.9]])
+    q7 = np.zeros((1, 7))
+    q7[:, free] = q3 + np.array([0.0, np.pi / 2, 0.0])
+    three = Plant(load_model("lwa4d_3dof", timestep=0.001, integrator="RK4"), q3)
+    seven = Plant(load_model("lwa4d_7dof", timestep=0.001, integrator="RK4"), q7)
+    seven.hold(held)
+    tau3, tau7 = np.array([[[2.0, -20.0, -4.0]]]), np.zeros((1, 1, 7))
+    tau7[0, 0, free] = tau3[0, 0]
+    for _ in range(30):
+        q, dq = three.advance(tau3, 10)
+        p, dp = seven.advance(tau7, 10)
+    np.testing.assert_allclose(p[:, :, free], q + np.array([0.0, np.pi / 2, 0.0]), atol=1e-5)
+    np.testing.assert_allclose(dp[:, :, free], dq, atol=1e-4)
+    assert np.abs(dq).max() > 1.0, "it moved"
+    np.testing.assert_array_equal(p[:, :, held], 0.0)
+    seven.hold(np.zeros(7, bool))
+    p, dp = seven.advance(tau7, 10)
+    assert np.abs(p[:, -1][:, held]).max() > 1e-6
