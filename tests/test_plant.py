@@ -335,7 +335,7 @@ def test_single_brakes_make_the_seven_joint_arm_the_three_joint_arm() -> None:
     seven.hold(held)
     tau3, tau7 = np.array([[[2.0, -20.0, -4.0]]]), np.zeros((1, 1, 7))
     tau7[0, 0, free] = tau3[0, 0]
-    for _ in range(30):
+    for _ in range(15):
         q, dq = three.advance(tau3, 10)
         p, dp = seven.advance(tau7, 10)
     np.testing.assert_allclose(p[:, :, free], q + np.array([0.0, np.pi / 2, 0.0]), atol=1e-5)
