@@ -17,7 +17,7 @@ from mujoco import rollout
 from mujoco.batch import Batch
 
 from lwa4d_sim.batch import default_workers
-from lwa4d_sim.cli import shipped_scenarios
+from lwa4d_sim.console import shipped_scenarios
 from lwa4d_sim.mjcf import load_model
 from lwa4d_sim.runner import run, run_batch
 from lwa4d_sim.scenario import Scenario

@@ -1,7 +1,7 @@
-"""Builds the blocks of a scenario and puts them together: the only place where settings become a loop."""
+"""Builds the blocks of a scenario: the only place where settings become objects."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -12,33 +12,27 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from lwa4d_sim.channels import Gate
 from lwa4d_sim.controllers import CustomController
 from lwa4d_sim.controllers.belief import build_beliefs
-from lwa4d_sim.drives import Drives
 from lwa4d_sim.errors import LwaError, ScenarioError
-from lwa4d_sim.estimators import Midpoint, TrueSource
-from lwa4d_sim.interfaces import NS_PER_S, Array, Controller, Ns, Trajectory, to_ns
+from lwa4d_sim.interfaces import NS_PER_S, Array, Controller, Estimator, Ns, Trajectory, to_ns
 from lwa4d_sim.kinematics import SerialKinematics, kinematics_for
-from lwa4d_sim.loop import ArmSide, ControllerSide, Link, Timing, simulate
+from lwa4d_sim.loop import ControllerSide, Timing
 from lwa4d_sim.mjcf import chain_of, home, load_model, torque_limits
 from lwa4d_sim.plant import Plant
-from lwa4d_sim.record import RunLog
-from lwa4d_sim.recorder import RunInfo, record
+from lwa4d_sim.recorder import RunInfo
 from lwa4d_sim.references import ReferenceBlocks, Remembered
 from lwa4d_sim.scenario import Scenario
 from lwa4d_sim.settings import IdealLoop, SampledLoop, Settings
 
 # A run longer than this many plant steps is taken for a mistake (assumed; 5 h of simulated time at 1 ms).
 MAX_STEPS = 20_000_000
-# Numbers of the random streams; a new source of randomness takes a new number and leaves the others' draws alone.
-_MEASUREMENT, _COMMAND = 1, 2
 # What members stepped together have in common, because one loop and one clock drive them all.
 _SHARED = ("arm", "loop", "plant.timestep", "plant.integrator", "plant.disturbances")
 
 
 @dataclass(frozen=True, slots=True)
-class _Arm:
+class PaperArm:
     """The arm's paper side, common to all members."""
 
     kinematics: SerialKinematics
@@ -54,8 +48,52 @@ class _Arm:
         return 3 if self.n < 6 else 6
 
 
-def run_together(scenarios: Sequence[Scenario], variant: str, threads: int) -> list[RunLog]:
-    """Run one variant of some scenarios in lock step; all but the shared settings may differ.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Blocks:
+    """What a scenario's variant is made of, before a link joins its two sides.
+
+    Attributes:
+        scenario, variant: where it comes from.
+        settings: of the first member; the shared ones hold for all.
+        arm: the arm on paper.
+        model: the first member's plant as MuJoCo knows it.
+        plant: the arm.
+        q0: start positions (N, n) [rad].
+        control: makes the controller side from an estimator.
+        timing: instants of a period.
+        timestep: plant step [ns].
+        infos: one for each member.
+    """
+
+    scenario: Scenario
+    variant: str
+    settings: Settings
+    arm: PaperArm
+    model: mujoco.MjModel
+    plant: Plant
+    q0: Array
+    control: Callable[[Estimator], ControllerSide]
+    timing: Timing
+    timestep: Ns
+    infos: list[RunInfo]
+
+    @contextmanager
+    def about(self, key: str) -> Iterator[None]:
+        """Name the place in the file in any error."""
+        with _about(self.scenario, self.variant, key):
+            yield
+
+
+@contextmanager
+def _about(scenario: Scenario, variant: str, key: str) -> Iterator[None]:
+    try:
+        yield
+    except LwaError as error:
+        raise scenario.locate(error, key, variant) from error
+
+
+def build_blocks(scenarios: Sequence[Scenario], variant: str, threads: int) -> Blocks:
+    """Everything but the link.
 
     Raises:
         ScenarioError: settings that fit the schema but not each other, or not the batch.
@@ -69,13 +107,8 @@ def run_together(scenarios: Sequence[Scenario], variant: str, threads: int) -> l
             if attrgetter(key)(member) != attrgetter(key)(first):
                 raise ScenarioError(f"{scenario.source}: member {k} of the batch differs in '{key}'; all must share it")
 
-    @contextmanager
-    def about(key: str) -> Iterator[None]:
-        """Name the place in the file in any error."""
-        try:
-            yield
-        except LwaError as error:
-            raise scenario.locate(error, key, variant) from error
+    def about(key: str) -> AbstractContextManager[None]:
+        return _about(scenario, variant, key)
 
     with about("plant.timestep"):
         timestep = _timestep(first)
@@ -85,7 +118,7 @@ def run_together(scenarios: Sequence[Scenario], variant: str, threads: int) -> l
         models = [_plant_model(member, scenario.folder) for member in members]
         shared = all(model is models[0] for model in models)
         kinematics = kinematics_for(chain_of(models[0]))
-        arm = _Arm(kinematics, home(models[0]), torque_limits(models[0]))
+        arm = PaperArm(kinematics, home(models[0]), torque_limits(models[0]))
     with about("initial.q"):
         q0 = np.stack([_start(member, arm) for member in members])
     with about("trajectory"):
@@ -96,32 +129,41 @@ def run_together(scenarios: Sequence[Scenario], variant: str, threads: int) -> l
         controller = _controller(members, arm)
         beliefs = [member.controller.model for member in members]
         model = build_beliefs(beliefs, first.arm, scenario.folder, threads)
-    seeds = [member.plant.seed for member in members]
     with about("plant.disturbances"):
         plant = Plant(models[0] if shared else models, q0, first.plant.disturbances, threads)
-    with about("loop"):
-        link, drives, source, estimator = _loop(first, arm, q0, timing, timestep, seeds)
     space = first.controller.space
     instant = timing.phase / NS_PER_S if not isinstance(first.loop, IdealLoop) else 0.5 * timestep / NS_PER_S
     references = ReferenceBlocks(trajectories, space, timing.period, instant, timing.ticks)
-    control = ControllerSide(estimator, references, controller, model)
-    side = ArmSide(plant, drives, source)
+
+    def control(estimator: Estimator) -> ControllerSide:
+        return ControllerSide(estimator, references, controller, model)
+
     infos = [
         RunInfo(
             name=scenario.name,
             variant=variant,
-            seed=seed,
+            seed=member.plant.seed,
             kinematics=kinematics,
             trajectory=trajectories[k % len(trajectories)],
             tau_max=arm.tau_max,
             scenario=scenarios[k].resolved(variant),
             versions=versions(),
         )
-        for k, seed in enumerate(seeds)
+        for k, member in enumerate(members)
     ]
-    with about("trajectory"):
-        ticks = simulate(side, control, link, timing, timestep)
-        return record(ticks, infos, timing, timestep, q0, full_ticks=not isinstance(first.loop, IdealLoop))
+    return Blocks(
+        scenario=scenario,
+        variant=variant,
+        settings=first,
+        arm=arm,
+        model=models[0],
+        plant=plant,
+        q0=q0,
+        control=control,
+        timing=timing,
+        timestep=timestep,
+        infos=infos,
+    )
 
 
 def _timestep(settings: Settings) -> Ns:
@@ -143,7 +185,7 @@ def _plant_model(settings: Settings, folder: Path) -> mujoco.MjModel:
     )
 
 
-def _start(settings: Settings, arm: _Arm) -> Array:
+def _start(settings: Settings, arm: PaperArm) -> Array:
     if settings.initial.q is None:
         return arm.home
     if len(settings.initial.q) != arm.n:
@@ -151,7 +193,7 @@ def _start(settings: Settings, arm: _Arm) -> Array:
     return np.asarray(settings.initial.q)
 
 
-def _trajectories(members: Sequence[Settings], arm: _Arm, q0: Array, folder: Path) -> list[Trajectory]:
+def _trajectories(members: Sequence[Settings], arm: PaperArm, q0: Array, folder: Path) -> list[Trajectory]:
     """One trajectory a member, or a single one that all share."""
     same = all(member.trajectory == members[0].trajectory for member in members) and (q0 == q0[0]).all()
     built: list[Trajectory] = [
@@ -180,7 +222,7 @@ def _timing(settings: Settings, timestep: Ns, duration: float) -> Timing:
         )
     if ticks == 0:
         raise ScenarioError("the motion lasts no time at all", key="trajectory")
-    phase = 0 if isinstance(loop, IdealLoop) else _phase(loop, period, timestep)
+    phase = _phase(loop, period, timestep) if isinstance(loop, SampledLoop) else 0
     return Timing(period, Ns(phase), ticks)
 
 
@@ -193,7 +235,7 @@ def _phase(loop: SampledLoop, period: int, timestep: int) -> int:
     return phase % period
 
 
-def _controller(members: Sequence[Settings], arm: _Arm) -> Controller:
+def _controller(members: Sequence[Settings], arm: PaperArm) -> Controller:
     parameters = [member.controller for member in members]
     first = parameters[0]
     if any(type(p) is not type(first) or p.space != first.space for p in parameters):
@@ -205,37 +247,6 @@ def _controller(members: Sequence[Settings], arm: _Arm) -> Controller:
     build: Any = type(first).build  # the parameters are all of this one type, which mypy cannot know
     made: Controller = build(parameters, arm.n, arm.task_size)
     return made
-
-
-def _loop(
-    settings: Settings, arm: _Arm, q0: Array, timing: Timing, timestep: Ns, seeds: Sequence[int]
-) -> tuple[Link, Drives, Any, Any]:
-    """Link, drives, velocity source and estimator; ideal is the case that costs nothing and holds nothing."""
-    dt = timestep / NS_PER_S
-    ideal = isinstance(settings.loop, IdealLoop)
-    loop = settings.loop if isinstance(settings.loop, SampledLoop) else SampledLoop(period=dt)
-    up, down = loop.transports
-    sync = timing.period if loop.actuation == "next_sync" else 0
-    link = Link(up.build(seeds, _MEASUREMENT, arm.n, Gate(1)), down.build(seeds, _COMMAND, arm.n, Gate(timestep, sync)))
-    drives = Drives(
-        arm.tau_max,
-        position_resolution=_resolution(loop.position_resolution, arm.n, "loop.position_resolution"),
-        torque_resolution=_resolution(loop.torque_resolution, arm.n, "loop.torque_resolution"),
-        late=loop.late_data,
-        period=loop.period,
-        timestep=timestep,
-    )
-    if ideal:
-        return link, drives, TrueSource(q0), Midpoint(q0, dt)
-    source, estimator = loop.velocity.build(q0, loop.period, dt)
-    return link, drives, source, estimator
-
-
-def _resolution(value: Any, n: int, key: str) -> Array | None:
-    steps = np.atleast_1d(np.asarray(value, float))
-    if len(steps) not in (1, n):
-        raise ScenarioError(f"has {len(steps)} values; give one number or one for each of {n} joints", key=key)
-    return np.broadcast_to(steps, (n,)).copy() if steps.any() else None
 
 
 @cache

@@ -3,13 +3,14 @@
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from lwa4d_sim.bus_cli import bus_app
+from lwa4d_sim.console import Json, Out, Set, busy, complain, override, progress, scenario_path, shipped_scenarios
 from lwa4d_sim.errors import LwaError, ScenarioError
 
 app = typer.Typer(
@@ -21,21 +22,18 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-_Json = Annotated[bool, typer.Option("--json", help="Print one machine-readable object on stdout.")]
-_Set = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key, e.g. controller.kp=2.0.")
-]
-_Out = Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder the results go into.")]
+
+app.add_typer(bus_app, name="bus")
 
 
 @app.command()
 def run(
     files: Annotated[list[str], typer.Argument(metavar="FILE...", help="Scenario files, or names of shipped ones.")],
-    out: _Out = Path("runs"),
-    overrides: _Set = None,
+    out: Out = Path("runs"),
+    overrides: Set = None,
     no_plots: Annotated[bool, typer.Option("--no-plots", help="Write records and summary only.")] = False,
     video: Annotated[bool, typer.Option("--video", help="Also render the arm as an animated picture.")] = False,
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """Run scenarios and write one folder of results for each.
 
@@ -44,7 +42,7 @@ def run(
     from lwa4d_sim.results import passed, run_scenario
     from lwa4d_sim.scenario import Scenario
 
-    values = dict(_override(text) for text in overrides or [])
+    values = dict(override(text) for text in overrides or [])
     scenarios = [Scenario.load(scenario_path(file), values) for file in files]
     names = [scenario.name for scenario in scenarios]
     for name in names:
@@ -52,7 +50,7 @@ def run(
             raise ScenarioError(f"two of the scenarios are named '{name}' and would share one folder")
     summaries = []
     for scenario in scenarios:
-        with _busy(f"running {scenario.name}", quiet=as_json):
+        with busy(f"running {scenario.name}", quiet=as_json):
             summary = run_scenario(scenario, out, plots=not no_plots)
             if video:
                 _video(scenario, Path(summary["folder"]))
@@ -76,7 +74,7 @@ def batch(
     junit: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a JUnit file for CI.")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", metavar="DIR", help="Keep the results here.")] = None,
     plots: Annotated[bool, typer.Option("--plots", help="With -o: draw plots and reports as well.")] = False,
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """Run every scenario of some folders in parallel and say which pass.
 
@@ -88,7 +86,7 @@ def batch(
     if junit is not None:
         check_writable(junit)
     jobs = []
-    with _progress("scenarios", len(files), quiet=as_json) as advance:
+    with progress("scenarios", len(files), quiet=as_json) as advance:
         for job in run_files(files, out, plots=plots and out is not None, workers=workers or default_workers()):
             jobs.append(job)
             advance()
@@ -96,7 +94,7 @@ def batch(
         write_junit(junit, jobs)
     for job in jobs:
         if job.error:
-            _complain(job.error)
+            complain(job.error)
     if as_json:
         rows = [{"file": str(j.file), "verdict": j.verdict, "error": j.error, **(j.summary or {})} for j in jobs]
         print(json.dumps({"scenarios": rows}))
@@ -110,7 +108,7 @@ def batch(
 def report(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders that `run` has written.")],
     out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The page to write.")] = Path("report.html"),
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """Put finished runs on one self-contained HTML page.
 
@@ -118,7 +116,7 @@ def report(
     """
     from lwa4d_sim.report import section_from_folder, write_report
 
-    with _busy("drawing", quiet=as_json):
+    with busy("drawing", quiet=as_json):
         write_report(out, [section_from_folder(folder) for folder in runs])
     print(json.dumps({"report": str(out)}) if as_json else f"report: {out}")
 
@@ -137,7 +135,7 @@ def schema(
 
 
 @app.command()
-def scenarios(as_json: _Json = False) -> None:
+def scenarios(as_json: Json = False) -> None:
     """List the scenarios that come with the package.
 
     Example: lwa4d-sim scenarios
@@ -149,28 +147,6 @@ def scenarios(as_json: _Json = False) -> None:
     for file in files:
         first = file.read_text(encoding="utf-8").splitlines()[0]
         print(f"{file.stem:28} {first.removeprefix('#').strip()}")
-
-
-def shipped_scenarios() -> Path:
-    """Folder of the shipped scenarios: inside an installed package, beside it in a checkout."""
-    here = Path(__file__).parent
-    return here / "scenarios" if (here / "scenarios").is_dir() else here.parent / "scenarios"
-
-
-def scenario_path(text: str) -> Path:
-    """The file ``text`` names: a path, or the name of a shipped scenario."""
-    path = Path(text)
-    shipped = shipped_scenarios() / f"{text}.yaml"
-    return shipped if not path.exists() and path.name == text and shipped.is_file() else path
-
-
-def _override(text: str) -> tuple[str, Any]:
-    from lwa4d_sim.yaml_text import parse
-
-    key, sign, value = text.partition("=")
-    if not sign or not key.strip():
-        raise ScenarioError(f"--set {text}: must be KEY=VALUE, e.g. controller.kp=2.0")
-    return key.strip(), parse(value, f"--set {key.strip()}", numbered=False)[0]
 
 
 def _combined(summaries: list[dict[str, Any]], out: Path) -> Path:
@@ -237,55 +213,22 @@ def _state(item: tuple[str, Any]) -> str:
     return f"{name}: {'stable' if variant['metrics']['stable'] else 'unstable'}"
 
 
-@contextmanager
-def _busy(text: str, *, quiet: bool) -> Iterator[None]:
-    """A spinner on stderr while something runs, where somebody watches."""
-    if quiet or not sys.stderr.isatty():
-        yield
-        return
-    from rich.console import Console
-
-    with Console(stderr=True).status(text):
-        yield
-
-
-@contextmanager
-def _progress(text: str, total: int, *, quiet: bool) -> Iterator[Any]:
-    """A progress bar on stderr, where somebody watches; yields the function to call per finished item."""
-    if quiet or not sys.stderr.isatty():
-        yield lambda: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task(text, total=total)
-        yield lambda: progress.advance(task)
-
-
 def main() -> None:
     """Entry point: runs the app and turns every expected error into one line and exit code 2."""
     sys.path.append(os.getcwd())  # a controller of one's own is found in the folder one works in
     try:
         code = app(sys.argv[1:] or ["--help"], standalone_mode=False) or 0
         if code == _INTERRUPTED:
-            _complain("interrupted; finished results are kept")
+            complain("interrupted; finished results are kept")
     except (LwaError, OSError) as error:
-        code = _complain(str(error))
+        code = complain(str(error))
     except MemoryError:
-        code = _complain("out of memory; a shorter motion or a longer plant.timestep needs less")
+        code = complain("out of memory; a shorter motion or a longer plant.timestep needs less")
     except Exception as error:
         if not hasattr(error, "format_message"):  # Typer's usage errors have no public class
             raise
-        code = _complain(f"{error.format_message()} (see lwa4d-sim --help)")
+        code = complain(f"{error.format_message()} (see lwa4d-sim --help)")
     sys.exit(code)
 
 
 _INTERRUPTED = 130  # Typer's exit code after Ctrl-C, as shells have it
-
-
-def _complain(text: str) -> int:
-    """Print one line on stderr; returns the exit code of bad input."""
-    print(f"lwa4d-sim: {' '.join(text.split())}", file=sys.stderr)
-    return 2

@@ -55,3 +55,7 @@ class TrajectoryError(LwaError, ValueError):
 
 class RecordError(LwaError, OSError):
     """A record cannot be written or read."""
+
+
+class BusError(LwaError, OSError):
+    """A bus, a node on it, or what it said, is not as it must be."""

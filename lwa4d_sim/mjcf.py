@@ -129,6 +129,12 @@ def torque_limits(model: mujoco.MjModel) -> Array:
     return np.asarray(torque_ranges(model)[..., 1].min(axis=0))
 
 
+def joint_facts(model: mujoco.MjModel) -> list[tuple[str, tuple[float, float] | None, float]]:
+    """Name, position limits [rad] or None, and largest torque [N m] of each joint."""
+    limits = [tuple(model.jnt_range[j].tolist()) if model.jnt_limited[j] else None for j in range(model.njnt)]
+    return [(model.joint(j).name, limits[j], float(peak)) for j, peak in enumerate(torque_limits(model))]
+
+
 def home(model: mujoco.MjModel) -> Array:
     """The keyframe ``home``, or the pose in which the file describes the arm, (n,) [rad]."""
     key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home")

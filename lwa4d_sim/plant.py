@@ -12,8 +12,8 @@ from mujoco.batch import Batch
 from lwa4d_sim.errors import ModelError
 from lwa4d_sim.interfaces import STRICT, Array, NonNegative, Positive, to_ns
 
-# Inertia [kg m^2] of a joint whose own brake is closed (assumed: 1e5 times the arm's). The joint moves 1e-8 rad in 10 ms
-# under the arm's weight, which is taken back, and the others feel it as part of the link before to one part in 1e5.
+# Inertia [kg m^2] of a joint whose own brake is closed (assumed: 1e5 times the arm's). The joint moves 1e-8 rad in
+# 10 ms under the arm's weight, which is taken back; the others feel it as one with its link to one part in 1e5.
 BRAKED_INERTIA = 1e6
 
 # A joint this fast is no arm any more (assumed: about a thousand times the fastest joint of the LWA4D).

@@ -13,6 +13,7 @@ import numpy as np
 
 from lwa4d_sim import metrics as _metrics
 from lwa4d_sim.errors import RecordError
+from lwa4d_sim.frame_log import FrameLog
 from lwa4d_sim.interfaces import NS_PER_S, Array, Ns, Trajectory
 
 FORMAT = 1  # of the HDF5 file; raised when a reader of the old one would misread the new one
@@ -65,6 +66,7 @@ class RunLog:
         events: (time [s], text).
         scenario: the variant's settings as written, for the file and the report.
         versions: of the software.
+        frames: what went over the simulated bus, or None.
     """
 
     name: str
@@ -83,6 +85,7 @@ class RunLog:
     scenario: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     paths: "Paths"
+    frames: FrameLog | None = None
 
     @property
     def t(self) -> Array:
@@ -144,6 +147,9 @@ class RunLog:
         _write_group(file, "ticks", {key: (getattr(self.ticks, key), unit) for key, unit in _TICK_UNITS.items()})
         parameters = {"knots": (self.knots, "s"), "tau_max": (self.tau_max, "N m")}
         _write_group(file, "parameters", parameters)
+        if self.frames is not None:
+            _write_group(file, "frames", self.frames.columns())
+            file["frames"].attrs["names"] = "\n".join(self.frames.names)
         for key, text in (("scenario", self.scenario), ("versions", self.versions)):
             # not attributes, which HDF5 limits to 64 kB
             file["parameters"].create_dataset(key, data=json.dumps(text), dtype=_text_type())
@@ -271,4 +277,5 @@ def _read(file: Any) -> RunLog:
         scenario=json.loads(parameters["scenario"][()]),
         versions=json.loads(parameters["versions"][()]),
         paths=StoredPaths(plant["x"][:], plant["x_ref"][:]),
+        frames=FrameLog.read(file["frames"]) if "frames" in file else None,
     )

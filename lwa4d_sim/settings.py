@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
-from annotated_types import Ge, Lt
+from annotated_types import Ge, Le, Lt
 
+from lwa4d_sim.bus.options import Noise, Profile, Traffic
 from lwa4d_sim.channels import Transport
 from lwa4d_sim.controllers import ControllerParameters
 from lwa4d_sim.delays import Latency, Loss
@@ -143,7 +144,37 @@ def _loss(loss: float | Loss) -> Loss:
     return loss if isinstance(loss, Loss) else Loss(probability=loss)
 
 
-LoopSettings = SampledLoop | IdealLoop
+@dataclass(frozen=True, kw_only=True)
+class CanopenLoop:
+    """The controller as CANopen master, a CiA 402 drive at each joint, and a timed CAN bus between them.
+
+    Attributes:
+        period: SYNC period [s], a whole number of plant steps (thesis: 0.01).
+        actuation: next_sync = a command acts at the SYNC after it, as with synchronous PDOs; immediate = when it
+            arrives.
+        velocity: how the controller gets the joint speed; `continuous` and `true` mean the drive's own speed signal.
+        bit_rate: [bit/s] (thesis: 500000); null for a bus on which frames take no time.
+        profile: cia402 = drives with a torque mode, which the real ones lack; lwa4d = torque as current offset.
+        deadline: from the SYNC to when the controller no longer waits for measurements [s]; default half a period.
+        heartbeat: heartbeat time of drives and master [s]; 0 for none.
+        noise: bit errors.
+        traffic: frames of other stations.
+    """
+
+    __pydantic_config__: ClassVar[Any] = STRICT
+    kind: Literal["canopen"] = "canopen"
+    period: Positive = 0.01
+    actuation: Literal["immediate", "next_sync"] = "next_sync"
+    velocity: VelocityParameters = field(default_factory=FilteredDerivative)
+    bit_rate: Annotated[int, Ge(10_000), Le(1_000_000)] | None = 500_000
+    profile: Profile = "cia402"
+    deadline: Positive | None = None
+    heartbeat: Annotated[float, Ge(0), Le(10)] = 0.1
+    noise: Noise = Noise()
+    traffic: tuple[Traffic, ...] = ()
+
+
+LoopSettings = SampledLoop | IdealLoop | CanopenLoop
 
 
 @dataclass(frozen=True, kw_only=True)

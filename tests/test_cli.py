@@ -149,9 +149,9 @@ def test_an_arm_may_be_a_file_beside_the_scenario_and_differ_between_variants(ca
 
 
 def test_a_shipped_scenario_goes_by_its_name(call: Callable[..., Result]) -> None:
-    assert cli.scenario_path("pd_joint_p2.5").is_file()
+    assert scenario_path("pd_joint_p2.5").is_file()
     write("pd_joint_p2.5")  # a file of that name comes first
-    assert cli.scenario_path("pd_joint_p2.5") == Path("pd_joint_p2.5")
+    assert scenario_path("pd_joint_p2.5") == Path("pd_joint_p2.5")
     listed = json.loads(call("scenarios", "--json").out)["scenarios"]
     assert listed.keys() == {path.stem for path in (ROOT / "scenarios").glob("*.yaml")}
     lines = call("scenarios").out.splitlines()

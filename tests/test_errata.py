@@ -7,7 +7,7 @@ import pytest
 
 from lwa4d_sim import Scenario, run
 from lwa4d_sim.arm import ARMS, GRAVITY, L1, L2, L3, L4, MODULES, load_arm
-from lwa4d_sim.cli import shipped_scenarios
+from lwa4d_sim.console import shipped_scenarios
 from lwa4d_sim.dh import DH_7DOF, THESIS_DH_3DOF, dh_forward
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.polynomials import boundary_polynomial, differentiate

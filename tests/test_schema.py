@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from jsonschema import Draft202012Validator
 
-from lwa4d_sim.cli import shipped_scenarios
+from lwa4d_sim.console import shipped_scenarios
 from lwa4d_sim.schema import json_schema
 from lwa4d_sim.yaml_text import parse
 

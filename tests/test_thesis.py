@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lwa4d_sim.cli import shipped_scenarios
+from lwa4d_sim.console import shipped_scenarios
 from lwa4d_sim.metrics import METRICS, VIBRATION_FLOOR, vibrating
 from lwa4d_sim.record import RunLog
 from lwa4d_sim.results import run_scenario

@@ -1,0 +1,108 @@
+"""Finds, checks and sets up the drives, up to switched on with closed brakes.
+
+The order is the thesis's (Table 3.3): PDOs and parameters, mode by SDO, NMT start, controlwords 0x06 and 0x07. 0x0F comes
+with the first torque.
+"""
+
+import struct
+from collections.abc import Callable, Sequence
+
+from lwa4d_sim.bus.master import FAULT, MASTER_NODE, NMT, PRE_OPERATIONAL, STATE_MASK, SWITCH_ON, TRIES, Master
+from lwa4d_sim.bus.stations import NEVER, TARGET_SPEED, Key, Station
+from lwa4d_sim.errors import BusError
+from lwa4d_sim.interfaces import Ns
+
+START = 0x01  # NMT command
+SHUTDOWN, FAULT_RESET = 0x06, 0x80  # CiA 402 controlwords
+READY, SWITCHED_ON = 0x21, 0x23  # statuswords under the mask
+SYNCHRONOUS, EVENT = 1, 255  # PDO transmission types
+
+
+def commission(master: Master, parameters: Sequence[tuple[Key, str, float]] = ()) -> None:
+    """Find, check and set up every drive; ends with all of them operational and switched on, brakes closed.
+
+    Args:
+        master: fresh.
+        parameters: further objects to write to each drive: (index, sub), `struct` format, value.
+
+    Raises:
+        BusError: a drive does not answer, is not what it should be, refuses, or does not switch on.
+    """
+    for station in master.stations:
+        master.frame(NMT, bytes([PRE_OPERATIONAL, station.node]))
+    for station in master.stations:
+        _identify(master, station)
+    for station in master.stations:
+        _set_up(master, station, parameters)
+    for station in master.stations:
+        master.frame(NMT, bytes([START, station.node]))
+    # what waited behind the requests, boot-up messages above all, comes now
+    master.wait(Ns(master.clock() + master.plan.period))
+    master.watch.start(master.clock())
+    for station in master.stations:
+        station.values.update({TARGET_SPEED: 0, (0x60B2, 0): 0, (0x6071, 0): 0, (0x6081, 0): 10_000})
+    _reach(master, FAULT_RESET, lambda status: not status & FAULT)
+    _reach(master, SHUTDOWN, lambda status: status & STATE_MASK == READY)
+    _reach(master, SWITCH_ON, lambda status: status & STATE_MASK == SWITCHED_ON)
+    master.watch.enabled = False
+
+
+def _identify(master: Master, station: Station) -> None:
+    node = station.node
+    device = int.from_bytes(master.client.read(node, 0x1000), "little")
+    if device & 0xFFFF != 402:
+        raise BusError(f"node {node}: is no drive: device type 0x{device:08X}, expected profile 402")
+    modes = int.from_bytes(master.client.read(node, 0x6502), "little")
+    if not modes >> master.layout.bit & 1:
+        raise BusError(
+            f"node {node}: does not support mode {master.layout.mode} of the profile '{master.plan.profile}'; "
+            f"its modes (0x6502) are 0x{modes:X}"
+        )
+
+
+def _set_up(master: Master, station: Station, parameters: Sequence[tuple[Key, str, float]]) -> None:
+    node, write = station.node, master.client.write
+    write(node, 0x1017, 0, struct.pack("<H", master.plan.heartbeat))
+    if master.plan.heartbeat:
+        consumer = MASTER_NODE << 16 | 3 * master.plan.heartbeat
+        write(node, 0x1016, 1, struct.pack("<I", consumer))
+    write(node, 0x60C2, 1, struct.pack("<B", min(255, max(1, round(master.plan.period / 1e6)))))
+    receive_type = EVENT if master.plan.immediate else SYNCHRONOUS
+    for i, mapping in enumerate(master.layout.receive):
+        _map(master, node, 0x1400 + i, 0x200 + 0x100 * i + node, receive_type, mapping)
+    for i, mapping in enumerate(master.layout.transmit):
+        _map(master, node, 0x1800 + i, 0x180 + 0x100 * i + node, SYNCHRONOUS, mapping)
+    for (index, sub), form, value in parameters:
+        write(node, index, sub, struct.pack(form, value))
+    write(node, 0x6060, 0, struct.pack("<b", master.layout.mode))
+
+
+def _map(
+    master: Master, node: int, index: int, cob_id: int, kind: int, items: Sequence[tuple[int, int, int, bool]]
+) -> None:
+    """The thesis's four steps: switch off, set identifier and type, write the entries, write the count back."""
+    write, table = master.client.write, index + 0x200
+    write(node, index, 1, struct.pack("<I", 1 << 31 | cob_id))
+    write(node, table, 0, b"\0")
+    write(node, index, 2, bytes([kind]))
+    for k, (obj, sub, bits, _) in enumerate(items, start=1):
+        write(node, table, k, struct.pack("<I", obj << 16 | sub << 8 | bits))
+    write(node, table, 0, bytes([len(items)]))
+    write(node, index, 1, struct.pack("<I", cob_id))
+
+
+def _reach(master: Master, control: int, there: Callable[[int], bool]) -> None:
+    """Send a controlword every cycle until every drive has got there."""
+    for attempt in range(TRIES):
+        start = master.clock()
+        master.sync()
+        master.gather()
+        if all(station.stamp != NEVER and there(station.status) for station in master.stations):
+            master.wait(Ns(start + master.plan.period))
+            return
+        # a fault is reset by the rising edge alone
+        master.command(None, 0 if control == FAULT_RESET and attempt % 2 else control)
+        master.wait(Ns(start + master.plan.period))
+    stuck = next(s for s in master.stations if s.stamp == NEVER or not there(s.status))
+    said = f"its statusword is 0x{stuck.status:04X}" if stuck.stamp != NEVER else "it sends no TPDO"
+    raise BusError(f"node {stuck.node}: does not follow controlword 0x{control:02X}; {said}")

@@ -1,0 +1,233 @@
+"""The CANopen master's work in every cycle: SYNC, measurements, set-points, and the orderly stop.
+
+Nothing here reads a clock or sleeps: time passes in the bus's `recv` alone, on the simulated wire as on a real one.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import can
+
+from lwa4d_sim.bus.client import Client
+from lwa4d_sim.bus.dictionary import Joint
+from lwa4d_sim.bus.options import FIRST_NODE, Profile
+from lwa4d_sim.bus.stations import (
+    CONTROL,
+    LAYOUTS,
+    NEVER,
+    POSITION,
+    SET_POINT,
+    TARGET_POSITION,
+    Station,
+    mappings,
+    torque_counts_per_newton_metre,
+)
+from lwa4d_sim.bus.watch import Watch
+from lwa4d_sim.errors import BusError
+from lwa4d_sim.interfaces import NS_PER_S, Array, Ns
+
+NMT, SYNC = 0x000, 0x080  # CiA 301, predefined connection set
+START, PRE_OPERATIONAL = 0x01, 0x80  # NMT commands
+SHUTDOWN, SWITCH_ON, QUICK_STOP, DISABLE_VOLTAGE, FAULT_RESET = 0x06, 0x07, 0x02, 0x00, 0x80  # CiA 402 controlwords
+# Statusword under the mask. A drive in fault or after a quick stop has bit 6 or 5 of its own.
+STATE_MASK, READY, SWITCHED_ON, ENABLED, QUICK_STOP_ACTIVE = 0x6F, 0x21, 0x23, 0x27, 0x07
+FAULT = 0x08
+MASTER_NODE = 127  # as which the master's heartbeat is heard (schunk_pg70, Schunk_0_63.dcf)
+HEARTBEAT_MS = 100  # LWA 4P's DCF; the LWA4D's leaves it off
+TRIES = 50  # SYNC cycles a state change may take (assumed)
+SYNCHRONOUS, EVENT = 1, 255  # PDO transmission types
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """What the master is to set up.
+
+    Attributes:
+        profile: of the drives.
+        joints: constants of each joint, in the order of the node ids.
+        period: SYNC period [ns].
+        immediate: commands act when they arrive, not at the next SYNC.
+        first_node: node id of the first joint.
+        heartbeat: producer time of the drives and the master [ms], 0 = off.
+        deadline: from the SYNC [ns] to when a cycle no longer waits for measurements.
+        enable: let the drives move; without it they stay switched on with closed brakes.
+    """
+
+    profile: Profile
+    joints: tuple[Joint, ...]
+    period: Ns
+    immediate: bool = False
+    first_node: int = FIRST_NODE
+    heartbeat: int = HEARTBEAT_MS
+    deadline: Ns
+    enable: bool = True
+
+
+class Bus(Protocol):
+    """The part of python-can's `BusABC` that is used; time passes in `recv`."""
+
+    channel_info: str
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Put a frame on the bus."""
+        ...
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """The next frame, or None after ``timeout`` [s]."""
+        ...
+
+
+class Master:
+    """The controller side's end of the bus.
+
+    Args:
+        bus: any python-can bus.
+        clock: the instant now [ns]; of the wire, or monotonic.
+        plan: what to set up.
+    """
+
+    def __init__(self, bus: Bus, clock: Callable[[], Ns], plan: Plan) -> None:
+        self.bus, self.clock, self.plan = bus, clock, plan
+        self.layout = LAYOUTS[plan.profile]
+        self.stations = [Station(plan.first_node + k, joint) for k, joint in enumerate(plan.joints)]
+        self.client = Client(self.send, lambda timeout, done: self.wait(Ns(self.clock() + round(timeout * 1e9)), done))
+        self.watch = Watch(self.stations, plan.period, plan.heartbeat)
+        self._by_node = {station.node: station for station in self.stations}
+        self._receive, self._transmit = mappings(self.layout.receive), mappings(self.layout.transmit)
+        self._cob = {
+            0x180 + 0x100 * i + station.node: (station, mapping, 1 << i)
+            for station in self.stations
+            for i, mapping in enumerate(self._transmit)
+        }
+        self._scale = [torque_counts_per_newton_metre(plan.profile, station.joint) for station in self.stations]
+        self._all = (1 << len(self._transmit)) - 1
+        self._waiting = 0
+        self.sync_at = NEVER
+        self._beat = Ns(0)
+
+    # -- the bus -----------------------------------------------------------------------------------------------------
+
+    def send(self, msg: can.Message) -> None:
+        """Put a frame on the bus.
+
+        Raises:
+            BusError: the bus does not take it.
+        """
+        try:
+            self.bus.send(msg)
+        except can.CanError as error:
+            raise BusError(f"cannot send on {self.bus.channel_info}: {error}") from error
+
+    def wait(self, until: Ns, done: Callable[[], bool] | None = None) -> bool:
+        """Take in what the bus brings until a condition holds or the instant has come; says whether it held."""
+        while done is None or not done():
+            left = until - self.clock()
+            if left <= 0 and done is None:
+                return False
+            try:
+                msg = self.bus.recv(max(left, 0) / NS_PER_S)
+            except can.CanError as error:
+                raise BusError(f"cannot receive from {self.bus.channel_info}: {error}") from error
+            if msg is not None:
+                self._take(msg)
+            elif left <= 0:
+                return bool(done())  # type: ignore[misc]
+        return True
+
+    def frame(self, cob_id: int, data: bytes) -> None:
+        self.send(can.Message(arbitration_id=cob_id, data=data, is_extended_id=False))
+
+    def _take(self, msg: can.Message) -> None:
+        if msg.is_error_frame or msg.is_extended_id or msg.is_remote_frame:
+            self.watch.odd(msg)
+            return
+        found = self._cob.get(msg.arbitration_id)
+        if found is None:
+            if 0x580 < msg.arbitration_id < 0x600:
+                self.client.notify(msg.arbitration_id, bytearray(msg.data), msg.timestamp)
+            else:
+                self.watch.heard(msg, self.clock(), self.sync_at)
+            return
+        station, mapping, bit = found
+        if len(msg.data) < mapping.size:
+            self.watch.short(station, msg)
+            return
+        station.values.update(mapping.unpack(msg.data))
+        if not station.fresh & bit:
+            station.fresh |= bit
+            if station.fresh == self._all:
+                self._waiting -= 1
+        if bit == 1:
+            station.stamp, station.since = self.sync_at, self.clock()
+
+    # -- one cycle ---------------------------------------------------------------------------------------------------
+
+    def sync(self) -> None:
+        """Begin a cycle: SYNC, and the master's heartbeat when it is due."""
+        for station in self.stations:
+            station.fresh = 0
+        self._waiting = len(self.stations)
+        self.sync_at = self.clock()
+        self.frame(SYNC, b"")
+        if self.plan.heartbeat and self.sync_at >= self._beat:
+            self.frame(0x700 + MASTER_NODE, b"\x05")
+            self._beat = Ns(self.sync_at + self.plan.heartbeat * 1_000_000)
+
+    def gather(self) -> bool:
+        """Wait until every drive has sent its measurements, at most until the deadline; says whether all have."""
+        complete = self.wait(Ns(self.sync_at + self.plan.deadline), lambda: not self._waiting)
+        for station in self.stations:
+            station.missed = 0 if station.fresh & 1 else station.missed + 1
+        return complete
+
+    def command(self, tau: Array | None, control: int | None = None) -> None:
+        """Send set-points and controlwords to all drives.
+
+        Args:
+            tau: torque (n,) [N m], finite; None = none.
+            control: controlword; default the one with which the drives move, if they may.
+        """
+        word = control if control is not None else self.layout.control if self.plan.enable else SWITCH_ON
+        torque = [0.0] * len(self.stations) if tau is None else tau.tolist()
+        for station, newton_metres, scale in zip(self.stations, torque, self._scale, strict=True):
+            values = station.values
+            values[CONTROL] = word
+            values[self.layout.torque] = max(-32767, min(32767, round(newton_metres * scale)))
+            # whichever position the drive looks at, it is to see no error there
+            values[SET_POINT] = values[TARGET_POSITION] = values.get(POSITION, 0)
+            for i, mapping in enumerate(self._receive):
+                self.frame(0x200 + 0x100 * i + station.node, mapping.pack(values.__getitem__))
+
+    # -- the end -----------------------------------------------------------------------------------------------------
+
+    def halt(self) -> None:
+        """One step towards standstill: quick stop to the drives that move, no voltage to those that have stopped."""
+        for station in self.stations:
+            moving = station.status & STATE_MASK in (ENABLED, QUICK_STOP_ACTIVE)
+            station.values[CONTROL] = QUICK_STOP if moving else DISABLE_VOLTAGE
+            station.values[self.layout.torque] = 0
+            for i, mapping in enumerate(self._receive):
+                self.frame(0x200 + 0x100 * i + station.node, mapping.pack(station.values.__getitem__))
+
+    def stop(self) -> None:
+        """Quick stop until no drive moves, then switch off; a silent drive is not waited for.
+
+        Raises:
+            BusError: the bus itself is gone.
+        """
+        self.watch.enabled = False
+        for _ in range(TRIES):
+            start = self.clock()
+            self.sync()
+            self.gather()
+            moving = (ENABLED, QUICK_STOP_ACTIVE)
+            if all(station.missed or station.status & STATE_MASK not in moving for station in self.stations):
+                break
+            self.halt()
+            self.wait(Ns(start + self.plan.period))
+        self.command(None, DISABLE_VOLTAGE)
+        self.sync()
+        for station in self.stations:
+            self.frame(NMT, bytes([PRE_OPERATIONAL, station.node]))
+        self.wait(Ns(self.clock() + self.plan.period))

@@ -1,0 +1,42 @@
+"""What a scenario may say about a CANopen bus: rate, profile, noise, other traffic and scripted faults."""
+
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+from annotated_types import Ge, Le, Lt
+
+from lwa4d_sim.interfaces import STRICT, NonNegative, Positive
+
+Profile = Literal["lwa4d", "cia402"]
+
+FIRST_NODE = 3  # node id of joint 1 (schunk_lwa4d, config/arm_driver.yaml); the arm's joints are 3 to 9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise:
+    """Bit errors on the wire: each spoils a frame, which is repeated after an error frame.
+
+    Attributes:
+        per_bit: probability that a bit is spoilt (assumed independent).
+    """
+
+    __pydantic_config__: ClassVar[Any] = STRICT
+    per_bit: Annotated[float, Ge(0), Lt(1)] = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Traffic:
+    """Frames of another station, sent regularly.
+
+    Attributes:
+        id: 11-bit identifier; the lower, the sooner it wins.
+        size: data bytes.
+        period: [s].
+        offset: of the first frame from the start [s].
+    """
+
+    __pydantic_config__: ClassVar[Any] = STRICT
+    id: Annotated[int, Ge(1), Le(0x7FF)]
+    size: Annotated[int, Ge(0), Le(8)] = 8
+    period: Positive
+    offset: NonNegative = 0.0

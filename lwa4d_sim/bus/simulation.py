@@ -1,0 +1,125 @@
+"""Arm, wire and master in one virtual time: the sampled loop with a real CANopen cycle in the middle."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import can
+import numpy as np
+
+from lwa4d_sim.bus.arm import BusArm, Physics, SpeedSignal
+from lwa4d_sim.bus.commission import commission
+from lwa4d_sim.bus.dictionary import Joint
+from lwa4d_sim.bus.master import Master, Plan
+from lwa4d_sim.bus.options import FIRST_NODE, Profile, Traffic
+from lwa4d_sim.bus.session import Control, Session
+from lwa4d_sim.bus.stations import opening
+from lwa4d_sim.bus.wire import Wire, WirePort
+from lwa4d_sim.frame_log import FrameLog
+from lwa4d_sim.interfaces import NS_PER_S, Ns, to_ns
+from lwa4d_sim.loop import Tick, Timing
+from lwa4d_sim.record import RunLog
+
+# The drives are set up before the run's first instant, with closed brakes. Seven of them need a third of a second at
+# 500 kbit/s; 10 s are enough at 20 kbit/s (assumed).
+STARTUP = Ns(-10 * NS_PER_S)
+
+
+class Simulation:
+    """A run over the simulated bus.
+
+    Args:
+        wire: the bus, at the instant `STARTUP`.
+        plant: the arm.
+        joints: constants of each joint.
+        profile: of the drives.
+        source: the drives' speed signal; None when the controller estimates the speed, the drive then knows it exactly.
+    """
+
+    def __init__(
+        self, wire: Wire, plant: Physics, joints: Sequence[Joint], profile: Profile, source: SpeedSignal | None
+    ) -> None:
+        self.wire = wire
+        wire.port("arm", self._received)  # hears for all drives; each speaks, and fails, by a controller of its own
+        self.ports: dict[int, WirePort] = {}
+        self.arm = BusArm(plant, joints, FIRST_NODE, profile, source, self._sender)
+        self._timer = Ns(2**62)
+        self._remind(self.arm.power_on(wire.now))
+
+    def run(self, plan: Plan, control: Control, timing: Timing, *, with_speed: bool) -> Iterator["Tick"]:
+        """Set up, then one `Tick` a period.
+
+        Raises:
+            BusError: the drives cannot be set up.
+        """
+        master = Master(self.wire.port("master"), lambda: self.wire.now, plan)
+        commission(master, opening(plan.profile))
+        self.wire.run_until(Ns(0))
+        self.session = Session(master, control, with_speed=with_speed)
+        self.master = master
+        for cycle in self.session.cycles(Ns(0), timing.ticks):
+            self.arm.catch_up(Ns((cycle.k + 1) * timing.period))
+            q, dq, tau = self.arm.collect()
+            lost = None if np.isfinite(dq).all() else np.array([True])
+            yield Tick(cycle.k, cycle.state, cycle.command, cycle.age, q, dq, tau, lost)
+
+    def annotated(self, log: RunLog) -> RunLog:
+        """The record of the run with the frames and what the master noted."""
+        said = [(t / NS_PER_S, text) for t, text in self.master.watch.events if t >= 0]
+        events = tuple(sorted([*log.events, *said]))
+        return replace(log, frames=FrameLog.of(self.wire.frames), events=events)
+
+    def _sender(self, node: int) -> Callable[[can.Message], None]:
+        port = self.wire.port(f"node {node}", lambda msg, now: self._told(node, msg, now), recovers=True)
+        self.ports[node] = port
+
+        def send(msg: can.Message) -> None:
+            with suppress(can.CanOperationError):  # bus-off: the frame is lost
+                port.send(msg)
+
+        return send
+
+    def _told(self, node: int, msg: can.Message, now: Ns) -> None:
+        """What a node's own controller reports: an error state, in which it may be deaf as well."""
+        if msg.is_error_frame:
+            self.arm.silence(node, deaf=self.ports[node].counters.off)
+            self.arm.nodes[node - FIRST_NODE].receive(msg, now)
+
+    def _received(self, msg: can.Message, now: Ns) -> None:
+        self._remind(self.arm.receive(msg, now))
+
+    def _remind(self, deadline: Ns | None) -> None:
+        """Be woken at the nodes' next deadline, unless that is already so."""
+        if deadline is not None and deadline < self._timer:
+            self._timer = deadline
+            self.wire.call_at(deadline, self._wake)
+
+    def _wake(self) -> None:
+        if self.wire.now < self._timer:
+            return
+        self._timer = Ns(2**62)
+        self._remind(self.arm.poll(self.wire.now))
+
+
+def add_traffic(wire: Wire, stations: Sequence[Traffic]) -> None:
+    """Let other stations send on the wire."""
+    for k, traffic in enumerate(stations):
+        port = wire.port(f"traffic {k + 1}", lambda msg, now: None)
+        _Sender(wire, port.send, traffic).arm()
+
+
+class _Sender:
+    """Sends one frame again and again."""
+
+    def __init__(self, wire: Wire, send: object, traffic: Traffic) -> None:
+        self._wire, self._send = wire, send
+        self._msg = can.Message(arbitration_id=traffic.id, data=bytes(traffic.size), is_extended_id=False)
+        self._period, self._next = to_ns(traffic.period), to_ns(traffic.offset)
+
+    def arm(self) -> None:
+        self._wire.call_at(Ns(self._next), self._fire)
+
+    def _fire(self) -> None:
+        self._send(self._msg)  # type: ignore[operator]
+        self._next = Ns(self._next + self._period)
+        self.arm()

@@ -1,0 +1,236 @@
+"""The commands `lwa4d-sim bus ...`: one side of a scenario on a real bus, or the bus itself looked at."""
+
+import json
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from lwa4d_sim.console import Json, Out, Set, busy, override, progress, scenario_path
+from lwa4d_sim.errors import ScenarioError
+
+bus_app = typer.Typer(
+    help="The arm or the controller on a CAN bus, and what the bus does.",
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+_File = Annotated[str, typer.Argument(metavar="FILE", help="Scenario file, or name of a shipped one.")]
+_Variant = Annotated[str | None, typer.Option(metavar="NAME", help="Variant; default the first with a CANopen loop.")]
+_Interface = Annotated[str, typer.Option("-i", "--interface", metavar="I", help="python-can's name, e.g. socketcan.")]
+_Channel = Annotated[str, typer.Option("-c", "--channel", metavar="C", help="Channel, e.g. can0 or 239.74.163.2.")]
+_Log = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Log all frames; the ending says how: .log .asc .blf .csv .db .trc")
+]
+_Seconds = Annotated[float | None, typer.Option(metavar="S", min=0.0, help="End after so many seconds.")]
+
+
+@bus_app.command()
+def timing(
+    file: _File,
+    out: Out = Path("runs"),
+    variant: _Variant = None,
+    overrides: Set = None,
+    cycles: Annotated[int, typer.Option(min=3, help="Cycles to look at.")] = 200,
+    as_json: Json = False,
+) -> None:
+    """Show one cycle on the simulated bus, its load, and response times beside their worst case.
+
+    Example: lwa4d-sim bus timing canopen7 -o runs
+    """
+    from lwa4d_sim.bus.build import bus_loop, canopen_run
+    from lwa4d_sim.bus_plots import draw_timing
+    from lwa4d_sim.bus_timing import analyse
+    from lwa4d_sim.frame_log import FrameLog
+
+    blocks = _blocks(file, variant, overrides)
+    loop = bus_loop(blocks.settings)
+    if loop.bit_rate is None:
+        raise ScenarioError(f"{blocks.scenario.source}: loop.bit_rate is null: frames take no time there")
+    simulation, ticks = canopen_run(blocks)
+    total = min(cycles, blocks.timing.ticks)
+    with progress("cycles", total, quiet=as_json) as advance:
+        for _, _tick in zip(range(total), ticks, strict=False):
+            advance()
+    found = analyse(FrameLog.of(simulation.wire.frames), loop.bit_rate, blocks.timing.period, total)
+    folder = out / f"{blocks.scenario.name}"
+    folder.mkdir(parents=True, exist_ok=True)
+    title = f"{blocks.scenario.name}, {blocks.variant}: one cycle at {loop.bit_rate // 1000} kbit/s"
+    picture = draw_timing(found, title, loop.period, folder / "bus_timing.png")
+    log = found.log
+    if as_json:
+        rows = [
+            {
+                "id": int(log.id[k]),
+                "bits": int(log.bits[k]),
+                "start": (int(log.started[k]) - found.start) / 1e9,
+                "end": (int(log.received[k]) - found.start) / 1e9,
+            }
+            for k in found.cycle
+        ]
+        response = {
+            str(r.id): {"max": float(r.seen.max()), "bound": r.bound if math.isfinite(r.bound) else None}
+            for r in found.responses
+        }
+        picture_path = str(picture.path)
+        print(json.dumps({"frames": rows, "load": found.load, "response": response, "picture": picture_path}))
+        return
+    print(f"{'frame':16} {'bits':>5} {'start [ms]':>11} {'end [ms]':>9}")
+    for k in found.cycle:
+        start, end = ((int(t) - found.start) / 1e6 for t in (log.started[k], log.received[k]))
+        print(f"{_name(int(log.id[k])):16} {int(log.bits[k]):5} {start:11.3f} {end:9.3f}")
+    print(f"\n{'identifier':16} {'frames':>7} {'longest [ms]':>13} {'worst case [ms]':>16}")
+    for r in found.responses:
+        bound = f"{r.bound * 1e3:.3f}" if math.isfinite(r.bound) else "none"
+        print(f"{r.name:16} {len(r.seen):7} {r.seen.max() * 1e3:13.3f} {bound:>16}")
+    print(f"\nbus load {100 * found.load:.1f} %\npicture: {picture.path}")
+
+
+@bus_app.command()
+def serve(
+    file: _File,
+    interface: _Interface,
+    channel: _Channel,
+    variant: _Variant = None,
+    overrides: Set = None,
+    per_sync: Annotated[
+        bool, typer.Option("--per-sync", help="Move the arm on by one period at each SYNC, not by the clock.")
+    ] = False,
+    log: _Log = None,
+    seconds: _Seconds = None,
+) -> None:
+    """Put the simulated arm on a bus, as CANopen drives for anybody's master. Ctrl-C ends it.
+
+    Example: lwa4d-sim bus serve ct7_joint -i udp_multicast -c 239.74.163.2
+    """
+    from lwa4d_sim.bus.build import bus_loop, served_arm
+    from lwa4d_sim.bus.connect import connect, log_to
+    from lwa4d_sim.bus.serve import monotonic
+    from lwa4d_sim.bus.serve import serve as keep_serving
+
+    blocks = _blocks(file, variant, overrides)
+    bus = connect(interface, channel, bus_loop(blocks.settings).bit_rate)
+    try:
+        log_to(bus, log)
+        arm = served_arm(blocks, bus, epoch=monotonic(), per_sync=per_sync)
+        nodes = ", ".join(str(node.node_id) for node in arm.nodes)
+        print(f"{blocks.settings.arm}: nodes {nodes} on {interface} {channel}; Ctrl-C ends", flush=True)
+        end = None if seconds is None else time.monotonic() + seconds
+        keep_serving(arm, bus, monotonic, lambda: end is not None and time.monotonic() > end)
+    except KeyboardInterrupt:
+        print("ended")
+    finally:
+        bus.shutdown()
+
+
+@bus_app.command()
+def drive(
+    file: _File,
+    interface: _Interface,
+    channel: _Channel,
+    variant: _Variant = None,
+    overrides: Set = None,
+    arm: Annotated[bool, typer.Option("--arm", help="Really enable the drives. Without it: a dry run.")] = False,
+    log: _Log = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", metavar="DIR", help="Write the record here.")] = None,
+    seconds: _Seconds = None,
+    as_json: Json = False,
+) -> None:
+    """Drive the arm on a bus with a scenario's controller. Without --arm, print the frames that would be sent.
+
+    Example: lwa4d-sim bus drive ct7_joint -i udp_multicast -c 239.74.163.2 --arm
+    """
+    blocks = _blocks(file, variant, overrides)
+    if not arm:
+        _dry_run(blocks)
+        return
+    result = _drive(blocks, interface, channel, log, out, seconds, quiet=as_json)
+    if as_json:
+        print(json.dumps(result))
+    else:
+        late = result["lateness"]
+        print(f"{result['cycles']} cycles, {result['missed']} missed; start of a cycle after its due time [ms]:")
+        print(f"  p50 {1e3 * late['p50']:.3f}, p99 {1e3 * late['p99']:.3f}, max {1e3 * late['max']:.3f}")
+        for count, low, high in result["histogram"]:
+            print(f"  {1e3 * low:8.3f} to {1e3 * high:8.3f}  {count:6}")
+        print(f"largest joint error {max(result['joint_error']):.4f} rad")
+        print(f"ended: {result['ended']}")
+    raise typer.Exit(0 if result["ended"] == "done" else 2)
+
+
+def _drive(
+    blocks: Any,
+    interface: str,
+    channel: str,
+    log: Path | None,
+    out: Path | None,
+    seconds: float | None,
+    *,
+    quiet: bool,
+) -> dict[str, Any]:
+    from lwa4d_sim.bus.build import bus_loop, driving_session
+    from lwa4d_sim.bus.connect import connect, log_to
+    from lwa4d_sim.bus.live_run import LiveRun
+    from lwa4d_sim.bus.serve import monotonic
+
+    loop = bus_loop(blocks.settings)
+    bus = connect(interface, channel, loop.bit_rate)
+    ticks = blocks.timing.ticks if seconds is None else min(blocks.timing.ticks, math.ceil(seconds / loop.period))
+    try:
+        log_to(bus, log)
+        master, session = driving_session(blocks, bus, monotonic, enable=True)
+        live = LiveRun(blocks, master, session)
+        with busy("setting up the drives", quiet=quiet):
+            live.set_up(loop.profile)
+        with progress("cycles", ticks, quiet=quiet) as advance:
+            ended = live.run(ticks, advance)
+    finally:
+        bus.shutdown()
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        live.record().save(out / f"{blocks.scenario.name}_bus.h5")
+    return {**live.summary(), "ended": ended}
+
+
+def _dry_run(blocks: Any) -> None:
+    """Print what the master would send, taken from a run against the simulated arm."""
+    from lwa4d_sim.bus.build import canopen_run
+    from lwa4d_sim.bus_timing import name_of
+
+    simulation, ticks = canopen_run(blocks)
+    for _, _tick in zip(range(3), ticks, strict=False):
+        pass
+    print("dry run: frames to the drives, from the simulated arm; --arm opens the bus and enables them")
+    for frame in simulation.wire.frames:
+        if frame.node == "master":
+            data = frame.data.hex().upper()
+            print(f"{frame.started / 1e9:12.6f}  {frame.can_id:03X}#{data:16}  {name_of(frame.can_id)}")
+
+
+def _blocks(file: str, variant: str | None, overrides: list[str] | None) -> Any:
+    """The scenario's blocks, with the loop on a bus."""
+    from lwa4d_sim.assembly import build_blocks
+    from lwa4d_sim.scenario import Scenario
+    from lwa4d_sim.settings import CanopenLoop, IdealLoop
+
+    scenario = Scenario.load(scenario_path(file), dict(override(text) for text in overrides or []))
+    names = list(scenario.variants)
+    if variant is not None and variant not in names:
+        raise ScenarioError(f"{scenario.source}: no variant '{variant}'; it has {', '.join(names)}")
+    fitting: list[Callable[[Any], bool]] = [
+        lambda loop: isinstance(loop, CanopenLoop),
+        lambda loop: not isinstance(loop, IdealLoop),
+    ]
+    chosen = variant or next((name for fits in fitting for name in names if fits(scenario.variants[name].loop)), None)
+    if chosen is None or isinstance(scenario.variants[chosen].loop, IdealLoop):
+        raise ScenarioError(f"{scenario.source}: an ideal loop has no bus; choose another variant")
+    return build_blocks([scenario], chosen, 1)
+
+
+def _name(can_id: int) -> str:
+    from lwa4d_sim.bus_timing import name_of
+
+    return f"{can_id:03X} {name_of(can_id)}"

@@ -1,0 +1,88 @@
+"""Picture of a bus: one cycle as a time line, and every identifier's response times beside their worst case."""
+
+from pathlib import Path
+
+import matplotlib.style
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from lwa4d_sim.bus_timing import BusTiming
+from lwa4d_sim.drawing import GREY, LOOK, PALETTE, SMALL, WIDTH, Picture, save
+from lwa4d_sim.interfaces import NS_PER_S
+
+_KINDS = ("SYNC and NMT", "measurements (TPDO)", "set-points (RPDO)", "the rest")
+_COLOURS = (PALETTE[1], PALETTE[0], PALETTE[2], GREY)
+
+CAPTION = (
+    "Above: one cycle on the wire, a bar for each frame from its first to its last bit, one line a station. "
+    "Below: for each identifier, the most urgent on top, how long its frames took from queued to received (dots) and "
+    "the worst that can happen by analysis (bar's end). A dot beyond its bar would be an error; an identifier without "
+    "a bar has no bound: the bus is overloaded for it."
+)
+
+
+def draw_timing(timing: BusTiming, title: str, period: float, path: Path) -> Picture:
+    """Draw one cycle and the response times.
+
+    Args:
+        timing: of the run.
+        title: of the picture.
+        period: SYNC period [s].
+        path: of the PNG.
+    """
+    with matplotlib.style.context(LOOK):
+        height = 2.6 + 0.17 * len(timing.responses) + 0.25 * len(timing.log.names)
+        figure = Figure(figsize=(WIDTH, height), layout="constrained")
+        FigureCanvasAgg(figure)
+        figure.suptitle(title)
+        line, below = figure.subplots(
+            2, 1, height_ratios=[max(2, len(timing.log.names)) + 3, 0.6 * len(timing.responses) + 2]
+        )
+        _time_line(line, timing, period)
+        _responses(below, timing)
+        return save(figure, Picture(path, title, CAPTION))
+
+
+def _kind(can_id: int) -> int:
+    if can_id in (0x000, 0x080):
+        return 0
+    if 0x180 <= can_id < 0x580:
+        return 1 if can_id & 0x080 else 2
+    return 3
+
+
+def _time_line(ax: Axes, timing: BusTiming, period: float) -> None:
+    log = timing.log
+    rows = timing.cycle
+    first = (log.started[rows] - timing.start) / NS_PER_S * 1e3
+    last = (log.received[rows] - timing.start) / NS_PER_S * 1e3
+    kinds = np.array([_kind(int(i)) for i in log.id[rows]])
+    lanes = [log.names[n] for n in log.node[rows]]
+    names = sorted(set(lanes), key=lambda lane: (lane != "master", lane))
+    place = {name: k for k, name in enumerate(names)}
+    y = np.array([place[lane] for lane in lanes])
+    for kind, (label, colour) in enumerate(zip(_KINDS, _COLOURS, strict=True)):
+        pick = kinds == kind
+        if pick.any():
+            ax.barh(y[pick], (last - first)[pick], left=first[pick], height=0.8, color=colour, label=label)
+    ax.set_yticks(range(len(names)), names, fontsize=SMALL)
+    ax.invert_yaxis()
+    ax.set_xlim(0, period * 1e3)
+    ax.set_xlabel("time in the cycle [ms]")
+    ax.set_title(f"bus load {100 * timing.load:.0f} %", fontsize=SMALL, loc="right")
+    ax.legend(ncols=4, fontsize=SMALL, loc="upper center", bbox_to_anchor=(0.5, -0.16))
+
+
+def _responses(ax: Axes, timing: BusTiming) -> None:
+    for k, response in enumerate(timing.responses):
+        if np.isfinite(response.bound):
+            ax.barh(k, response.bound * 1e3, height=0.7, color="#dddddd")
+        colour = _COLOURS[_kind(response.id)]
+        seen = np.unique(np.round(response.seen * 1e3, 3))
+        ax.plot(seen, np.full(len(seen), k), ".", ms=3, color=colour)
+    ax.set_yticks(range(len(timing.responses)), [f"{r.name}" for r in timing.responses], fontsize=SMALL - 3)
+    ax.invert_yaxis()
+    ax.set_xlim(left=0)
+    ax.set_xlabel("from queued to received [ms]; grey: worst case by analysis")
