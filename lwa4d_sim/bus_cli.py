@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lwa4d_sim.console import Json, Out, Set, busy, override, progress, scenario_path
+from lwa4d_sim.console import Json, Out, Set, override, progress, scenario_path
 from lwa4d_sim.errors import ScenarioError
 
 bus_app = typer.Typer(
@@ -26,6 +26,9 @@ _Log = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Log all frames; the ending says how: .log .asc .blf .csv .db .trc")
 ]
 _Seconds = Annotated[float | None, typer.Option(metavar="S", min=0.0, help="End after so many seconds.")]
+_Realtime = Annotated[
+    bool, typer.Option("--realtime", help="Go ahead of all ordinary processes (SCHED_FIFO), where that is allowed.")
+]
 
 
 @bus_app.command()
@@ -101,13 +104,15 @@ def serve(
     ] = False,
     log: _Log = None,
     seconds: _Seconds = None,
+    realtime: _Realtime = False,
 ) -> None:
     """Put the simulated arm on a bus, as CANopen drives for anybody's master. Ctrl-C ends it.
 
-    Example: lwa4d-sim bus serve ct7_joint -i udp_multicast -c 239.74.163.2
+    Example: lwa4d-sim bus serve canopen7_live -i udp_multicast -c 239.74.163.2
     """
     from lwa4d_sim.bus.build import bus_loop, served_arm
     from lwa4d_sim.bus.connect import connect, log_to
+    from lwa4d_sim.bus.process import stoppable, undisturbed
     from lwa4d_sim.bus.serve import monotonic
     from lwa4d_sim.bus.serve import serve as keep_serving
 
@@ -115,13 +120,14 @@ def serve(
     bus = connect(interface, channel, bus_loop(blocks.settings).bit_rate)
     try:
         log_to(bus, log)
-        arm = served_arm(blocks, bus, epoch=monotonic(), per_sync=per_sync)
-        nodes = ", ".join(str(node.node_id) for node in arm.nodes)
-        print(f"{blocks.settings.arm}: nodes {nodes} on {interface} {channel}; Ctrl-C ends", flush=True)
-        end = None if seconds is None else time.monotonic() + seconds
-        keep_serving(arm, bus, monotonic, lambda: end is not None and time.monotonic() > end)
-    except KeyboardInterrupt:
-        print("ended")
+        with stoppable() as stop:
+            arm = served_arm(blocks, bus, epoch=monotonic(), per_sync=per_sync)
+            nodes = ", ".join(str(node.node_id) for node in arm.nodes)
+            end = math.inf if seconds is None else time.monotonic() + seconds
+            with undisturbed(realtime=realtime):
+                print(f"{blocks.settings.arm}: nodes {nodes} on {interface} {channel}; Ctrl-C ends", flush=True)
+                keep_serving(arm, bus, monotonic, lambda: stop() or time.monotonic() > end)
+        print(f"ended; brakes closed: {sum(drive.braked for drive in arm.drives)} of {len(arm.drives)}")
     finally:
         bus.shutdown()
 
@@ -137,62 +143,34 @@ def drive(
     log: _Log = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", metavar="DIR", help="Write the record here.")] = None,
     seconds: _Seconds = None,
+    realtime: _Realtime = False,
     as_json: Json = False,
 ) -> None:
     """Drive the arm on a bus with a scenario's controller. Without --arm, print the frames that would be sent.
 
-    Example: lwa4d-sim bus drive ct7_joint -i udp_multicast -c 239.74.163.2 --arm
+    Example: lwa4d-sim bus drive canopen7_live -i udp_multicast -c 239.74.163.2 --arm
     """
     blocks = _blocks(file, variant, overrides)
     if not arm:
         _dry_run(blocks)
         return
-    result = _drive(blocks, interface, channel, log, out, seconds, quiet=as_json)
-    if as_json:
-        print(json.dumps(result))
-    else:
-        late = result["lateness"]
-        print(f"{result['cycles']} cycles, {result['missed']} missed; start of a cycle after its due time [ms]:")
-        print(f"  p50 {1e3 * late['p50']:.3f}, p99 {1e3 * late['p99']:.3f}, max {1e3 * late['max']:.3f}")
-        for count, low, high in result["histogram"]:
-            print(f"  {1e3 * low:8.3f} to {1e3 * high:8.3f}  {count:6}")
-        print(f"largest joint error {max(result['joint_error']):.4f} rad")
-        print(f"ended: {result['ended']}")
-    raise typer.Exit(0 if result["ended"] == "done" else 2)
-
-
-def _drive(
-    blocks: Any,
-    interface: str,
-    channel: str,
-    log: Path | None,
-    out: Path | None,
-    seconds: float | None,
-    *,
-    quiet: bool,
-) -> dict[str, Any]:
-    from lwa4d_sim.bus.build import bus_loop, driving_session
+    from lwa4d_sim.bus.build import bus_loop
     from lwa4d_sim.bus.connect import connect, log_to
-    from lwa4d_sim.bus.live_run import LiveRun
-    from lwa4d_sim.bus.serve import monotonic
+    from lwa4d_sim.bus.live_run import drive_arm, report
+    from lwa4d_sim.bus.process import stoppable
 
-    loop = bus_loop(blocks.settings)
-    bus = connect(interface, channel, loop.bit_rate)
-    ticks = blocks.timing.ticks if seconds is None else min(blocks.timing.ticks, math.ceil(seconds / loop.period))
+    bus = connect(interface, channel, bus_loop(blocks.settings).bit_rate)
     try:
         log_to(bus, log)
-        master, session = driving_session(blocks, bus, monotonic, enable=True)
-        live = LiveRun(blocks, master, session)
-        with busy("setting up the drives", quiet=quiet):
-            live.set_up(loop.profile)
-        with progress("cycles", ticks, quiet=quiet) as advance:
-            ended = live.run(ticks, advance)
+        with stoppable() as stop:
+            live, found = drive_arm(blocks, bus, stop, seconds=seconds, realtime=realtime)
     finally:
         bus.shutdown()
+    print(json.dumps(found) if as_json else report(found))
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         live.record().save(out / f"{blocks.scenario.name}_bus.h5")
-    return {**live.summary(), "ended": ended}
+    raise typer.Exit(0 if found["ended"] == "done" else 2)
 
 
 def _dry_run(blocks: Any) -> None:

@@ -66,7 +66,16 @@ def _time_line(ax: Axes, timing: BusTiming, period: float) -> None:
     for kind, (label, colour) in enumerate(zip(_KINDS, _COLOURS, strict=True)):
         pick = kinds == kind
         if pick.any():
-            ax.barh(y[pick], (last - first)[pick], left=first[pick], height=0.8, color=colour, label=label)
+            ax.barh(
+                y[pick],
+                (last - first)[pick],
+                left=first[pick],
+                height=0.8,
+                color=colour,
+                label=label,
+                edgecolor="white",
+                linewidth=0.6,
+            )
     ax.set_yticks(range(len(names)), names, fontsize=SMALL)
     ax.invert_yaxis()
     ax.set_xlim(0, period * 1e3)

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
-from annotated_types import Ge, Gt, Lt, MinLen
+from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
@@ -255,5 +255,5 @@ _NOUNS: Mapping[Any, tuple[str, str]] = {
 
 def _bound(rule: Any) -> str:
     """A limit in words, or nothing for a rule that is none."""
-    words = {Gt: "above", Ge: "of at least", Lt: "below"}
+    words = {Gt: "above", Ge: "of at least", Lt: "below", Le: "of at most"}
     return f"{words[type(rule)]} {getattr(rule, type(rule).__name__.lower())}" if type(rule) in words else ""

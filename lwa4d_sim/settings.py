@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Le, Lt
 
+from lwa4d_sim.bus.fault_options import Fault
 from lwa4d_sim.bus.options import Noise, Profile, Traffic
 from lwa4d_sim.channels import Transport
 from lwa4d_sim.controllers import ControllerParameters
@@ -154,11 +155,13 @@ class CanopenLoop:
             arrives.
         velocity: how the controller gets the joint speed; `continuous` and `true` mean the drive's own speed signal.
         bit_rate: [bit/s] (thesis: 500000); null for a bus on which frames take no time.
-        profile: cia402 = drives with a torque mode, which the real ones lack; lwa4d = torque as current offset.
+        profile: lwa4d = as the real firmware, torque as current offset; cia402 = with the torque mode it lacks.
         deadline: from the SYNC to when the controller no longer waits for measurements [s]; default half a period.
         heartbeat: heartbeat time of drives and master [s]; 0 for none.
+        following_error: distance of a joint from its desired motion at which the arm is stopped [rad]; default none.
         noise: bit errors.
         traffic: frames of other stations.
+        faults: what goes wrong, and when.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -167,11 +170,13 @@ class CanopenLoop:
     actuation: Literal["immediate", "next_sync"] = "next_sync"
     velocity: VelocityParameters = field(default_factory=FilteredDerivative)
     bit_rate: Annotated[int, Ge(10_000), Le(1_000_000)] | None = 500_000
-    profile: Profile = "cia402"
+    profile: Profile = "lwa4d"
     deadline: Positive | None = None
     heartbeat: Annotated[float, Ge(0), Le(10)] = 0.1
+    following_error: Positive | None = None
     noise: Noise = Noise()
     traffic: tuple[Traffic, ...] = ()
+    faults: tuple[Fault, ...] = ()
 
 
 LoopSettings = SampledLoop | IdealLoop | CanopenLoop

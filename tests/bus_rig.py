@@ -22,6 +22,7 @@ class Bench:
     def __init__(self, profile: Profile = "cia402", *, gravity: float = 8.0, q: float = 0.3, **options: Any) -> None:
         self.inertia, self.viscous, self.coulomb, self.gravity = 0.6, 1.0, 0.5, gravity
         self.q, self.dq, self.now = q, 0.0, 0
+        self.blocked, self.load = False, 0.0  # held from outside; torque from outside [N m]
         self.errors: list[tuple[int, int]] = []
         self.gone: list[int] = []
         self.log: list[tuple[int, float, float, float, bool]] = []  # ms, q, dq, tau, braked
@@ -113,11 +114,11 @@ class Bench:
             t = Ns(len(self.log) * MS)
             tau = self.drive.torque(t, 0.001)
             assert math.isfinite(tau)
-            if self.drive.braked:
+            if self.drive.braked or self.blocked:
                 self.dq = 0.0
             else:
                 for _ in range(4):  # small enough to neglect the integration error
-                    push = tau - self.viscous * self.dq - self.gravity * math.cos(self.q)
+                    push = tau + self.load - self.viscous * self.dq - self.gravity * math.cos(self.q)
                     rub = self.coulomb * math.tanh(self.dq / 1e-3)
                     self.dq += (push - rub) / self.inertia * 0.00025
                     self.q += self.dq * 0.00025

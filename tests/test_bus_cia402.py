@@ -155,8 +155,9 @@ def test_a_bit_held_since_before_the_fault_does_not_reset_it() -> None:
     assert made.command(0x8F) is None
     assert made.state is S.FAULT
     assert made.command(0x0F) is None
-    assert made.command(0x8F) is not None
-    assert made.state is S.SWITCH_ON_DISABLED
+    arrow = made.command(0x8F)
+    assert arrow is not None
+    assert (arrow.number, arrow.target) == (15, S.SWITCH_ON_DISABLED)
 
 
 def test_a_cause_that_persists_keeps_the_fault_and_needs_a_new_edge() -> None:
@@ -196,8 +197,9 @@ def test_a_word_received_again_counts_again_but_does_not_end_a_quick_stop() -> N
     assert made.command(0x1F) is None  # nor by a bit that is no command
     assert made.state is S.QUICK_STOP
     made.command(0x02)
-    assert made.command(0x0F) is not None
-    assert made.state is S.OPERATION_ENABLED
+    arrow = made.command(0x0F)
+    assert arrow is not None
+    assert (arrow.number, arrow.target) == (16, S.OPERATION_ENABLED)
 
 
 def test_without_stay_a_quick_stop_cannot_be_called_off() -> None:
@@ -213,7 +215,8 @@ def test_a_ramp_down_can_be_called_off_or_changed_into_another() -> None:
     assert made.ending is not None
     assert made.command(0x07) is None  # already begun
     made.command(0x0F)
-    assert (made.state, made.ending) == (S.OPERATION_ENABLED, None)
+    assert made.state is S.OPERATION_ENABLED
+    assert not made.ending
     made.command(0x07)
     made.command(0x06)
     made.finish()

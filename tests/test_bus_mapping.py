@@ -6,7 +6,7 @@ from typing import Any
 import canopen
 import pytest
 from canopen.objectdictionary import ODVariable, datatypes
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lwa4d_sim.bus.mapping import Item, Key, Mapping
@@ -44,6 +44,7 @@ def maps(draw: st.DrawFn) -> tuple[list[Item], dict[Key, int]]:
     return items, values
 
 
+@settings(deadline=None)
 @given(maps())
 def test_what_is_packed_comes_out_again(drawn: tuple[list[Item], dict[Key, int]]) -> None:
     items, values = drawn
@@ -55,6 +56,7 @@ def test_what_is_packed_comes_out_again(drawn: tuple[list[Item], dict[Key, int]]
     assert list(mapping.values(data + b"\xff\xff")) == list(values.values())  # bytes beyond do not count
 
 
+@settings(deadline=None)
 @given(maps())
 def test_bits_lie_where_the_standard_puts_them(drawn: tuple[list[Item], dict[Key, int]]) -> None:
     """Built bit by bit from a string, lowest bit first."""
@@ -87,6 +89,7 @@ def library_maps(draw: st.DrawFn) -> list[tuple[int, int, int]]:
     return fields
 
 
+@settings(deadline=None)
 @given(library_maps())
 def test_the_canopen_library_packs_the_same(fields: list[tuple[int, int, int]]) -> None:
     od = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
@@ -128,6 +131,7 @@ def test_gaps_are_skipped_and_sent_as_zero() -> None:
     assert mapping.pack({(0x6060, 0): -1, (0x6040, 0): 6}.__getitem__).hex() == "00ff00000600"
 
 
+@settings(deadline=None)
 @given(st.floats(width=32), st.integers(0, 7))
 def test_floats_pass_at_any_bit(value: float, shift: int) -> None:
     items: list[Item] = [(0x2000, 0, shift, False)] * bool(shift) + [(0x200D, 1, 32, datatypes.REAL32)]
@@ -151,6 +155,7 @@ def test_what_does_not_fit_or_is_no_number_is_refused(items: list[Item]) -> None
         Mapping(items)
 
 
+@settings(deadline=None)
 @given(st.sampled_from([(16, True), (16, False), (13, True), (13, False)]), st.integers(0, 1 << 20), st.booleans())
 def test_a_value_that_does_not_fit_is_never_cut(field: tuple[int, bool], excess: int, below: bool) -> None:
     bits, signed = field

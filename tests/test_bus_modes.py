@@ -4,10 +4,11 @@ import math
 from typing import Any
 
 import pytest
-from bus_rig import JOINT, MDEG, Bench, Profile
+from bus_rig import JOINT, MDEG, MS, Bench, Profile
 
 from lwa4d_sim.bus.cia402 import State
 from lwa4d_sim.bus.entry import Abort
+from lwa4d_sim.interfaces import Ns
 
 BOTH = pytest.mark.parametrize("profile", ["cia402", "lwa4d"])
 NEAR = 0.002  # [rad] the loops follow a moving reference this well, friction and gravity unknown to them
@@ -107,6 +108,19 @@ def test_change_at_once_and_relative_targets() -> None:
         bench.until(lambda: not bench.bit(10))
         bench.until(lambda: bench.bit(10))
     assert bench.get(0x6062) == -15_000
+
+
+@BOTH
+def test_a_start_bit_that_stood_before_the_drive_was_enabled_starts_nothing(profile: Profile) -> None:
+    bench = Bench(profile)
+    bench.set(0x6060, 0, 1)
+    bench.set(0x607A, 0, 50_000)
+    for word in (0x16, 0x17, 0x1F):
+        bench.word(word)
+    assert bench.state is State.OPERATION_ENABLED
+    bench.run(300)
+    assert not bench.bit(12)
+    assert bench.q == pytest.approx(0.3, abs=2e-3)
 
 
 @BOTH
@@ -253,8 +267,7 @@ def test_a_speed_offset_is_added_to_the_feed_forward() -> None:
     bench.enable(8)
     bench.set(0x60B1, 0, 4_000)
     bench.set(0x607A, 0, 0)
-    assert bench.drive.steering.mode.demand(bench.now * 1_000_000).dq == pytest.approx(4_000 / MDEG)
-    assert bench.get(0x606B) == 0 or bench.run(1) is None
+    assert bench.get(0x606B) == 4_000
     bench.run(300)
     # position and speed loop settle where both agree: kp (0 - q) + offset = 0
     assert bench.q == pytest.approx(4_000 / MDEG / 40, rel=0.05)
@@ -357,7 +370,7 @@ def test_torque_is_what_is_asked_and_stays(mode: int) -> None:
     bench.set(0x6071, 0, 100)
     bench.run(3)
     tau = 0.1 * JOINT.torque
-    assert bench.drive.torque(bench.now * 1_000_000, 0.001) == tau
+    assert bench.drive.torque(Ns(bench.now * MS), 0.001) == tau
     assert bench.get(0x6077) == 100
     bench.run(2)
     assert bench.drive.steady
@@ -510,7 +523,7 @@ def test_homing_that_cannot_succeed_says_so() -> None:
     bench.until(lambda: bench.bit(10))
     assert not bench.bit(12)
     assert bench.drive.axis.zero == 0.0
-    assert 1.9 < bench.q < JOINT.high
+    assert 1.9 < bench.q < 2.0
 
 
 def test_homing_is_interrupted_by_its_bit_and_taken_up_after_a_halt() -> None:
@@ -597,6 +610,22 @@ def test_a_jump_of_the_set_point_is_a_following_error_and_not_a_jump(
     assert bench.get(0x603F) == 0x8611
     assert max(dq for _, _, dq, _, _ in bench.log) < 1.1 * JOINT.speed
     assert bench.q < 0.3 + 0.2  # far from the 1.4 rad asked for
+
+
+@pytest.mark.parametrize(("mode", "key", "word"), [(7, (0x60C1, 1), 0x1F), (8, (0x607A, 0), 0x0F)])
+def test_unwatched_a_jump_is_followed_at_the_speed_limit(mode: int, key: tuple[int, int], word: int) -> None:
+    bench = Bench(q=0.3)
+    bench.set(0x6065, 0, 0xFFFF_FFFF)
+    bench.enable(mode, word)
+    bench.each = lambda k: bench.set(*key, 80_000)
+    bench.run(101)
+    begin = bench.get(0x6062)
+    bench.run(500)
+    assert bench.get(0x6062) - begin == pytest.approx(0.5 * JOINT.speed * MDEG, rel=0.01)
+    assert bench.bit(11)
+    bench.run(2000)
+    assert bench.get(0x6064) == pytest.approx(80_000, abs=50)
+    assert not bench.bit(11)
 
 
 @pytest.mark.parametrize(("mode", "word"), [(1, 0x1F), (3, 0x0F), (8, 0x0F), (9, 0x0F)])

@@ -1,6 +1,7 @@
 """Motions inside a drive against the closed forms of school physics, and against a sum over small steps."""
 
 import math
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -48,7 +49,7 @@ def test_a_move_keeps_its_limits_and_is_one_curve(
     samples = points(motion)
     assert samples[0][1].q == pytest.approx(q, abs=1e-9)
     assert motion.at(motion.end) == Point(target, 0.0, 0.0)
-    for (t0, before), (t1, after) in zip(samples, samples[1:], strict=False):
+    for (t0, before), (t1, after) in pairwise(samples):
         assert abs(after.dq) <= max(v, abs(dq)) + 1e-9
         assert -1e-9 <= max(abs(after.ddq), abs(before.ddq)) <= max(a, d) + 1e-9
         # position is the integral of speed, and speed of acceleration: neither jumps
@@ -71,10 +72,8 @@ def test_a_move_that_can_go_straight_never_turns_round(
 @given(q=POSITIONS, dq=SPEEDS, speed=SPEEDS, a=RATES, d=RATES)
 def test_a_speed_ramp_takes_the_time_of_its_two_rates(q: float, dq: float, speed: float, a: float, d: float) -> None:
     motion = change_speed(T0, Point(q, dq, 0.0), speed, a, d)
-    if dq * speed < 0:
-        expected = abs(dq) / d + abs(speed) / a
-    else:
-        expected = abs(speed - dq) / (a if abs(speed) > abs(dq) else d)
+    straight = abs(speed - dq) / (a if abs(speed) > abs(dq) else d)
+    expected = abs(dq) / d + abs(speed) / a if dq * speed < 0 else straight
     assert motion.duration == pytest.approx(expected, rel=1e-9, abs=1e-12)
     end = motion.at(motion.end)
     assert end.dq == pytest.approx(speed)

@@ -189,6 +189,16 @@ def test_a_block_that_came_in_part_is_sent_again_from_there(bench: Bench) -> Non
     assert bench.sdo("a203040000000000")[:2] == f"{0xC1 | 5 << 2:02x}"
 
 
+def test_a_last_segment_after_a_gap_is_not_the_end(bench: Bench) -> None:
+    assert bench.sdo(f"c2{SCRATCH_HEX}0f000000") == f"a0{SCRATCH_HEX}7f000000"
+    assert bench.sdo("0161626364656667") == ""
+    assert bench.sdo("836f000000000000") == "a2017f0000000000"
+    assert bench.sdo("0168696a6b6c6d6e") == ""
+    assert bench.sdo("826f000000000000") == "a2027f0000000000"
+    assert bench.sdo("d900000000000000") == "a100000000000000"
+    assert bench.dictionary[SCRATCH, 0] == b"abcdefghijklmno"
+
+
 @pytest.mark.parametrize("length", range(8))
 def test_a_short_request_is_no_request(bench: Bench, length: int) -> None:
     assert bench.put(0x600 + NODE, bytes.fromhex("4000100000000000")[:length]) == []

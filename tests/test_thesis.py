@@ -12,6 +12,7 @@ from lwa4d_sim.record import RunLog
 from lwa4d_sim.results import run_scenario
 from lwa4d_sim.runner import measure, run_all, run_batch
 from lwa4d_sim.scenario import Scenario
+from lwa4d_sim.settings import CanopenLoop
 
 SCENARIOS = sorted(shipped_scenarios().glob("*.yaml"))
 
@@ -45,12 +46,20 @@ def test_scenario_meets_its_expectations_at_any_plant_step(file: Path) -> None:
     assert not any(broken.values()), broken
     fine = measure(run_all(Scenario.load(file, {"plant.timestep": 0.0005})))
     for name, variant in summary["variants"].items():
-        compare(variant["metrics"], fine[name])
+        counts = isinstance(scenario.variants[name].loop, CanopenLoop)
+        compare(variant["metrics"], fine[name], counts=counts)
 
 
-def compare(coarse: dict[str, Any], fine: dict[str, Any]) -> None:
-    """Metrics of one variant at two plant steps; of an unstable one only the onset, to one control period."""
+def compare(coarse: dict[str, Any], fine: dict[str, Any], *, counts: bool) -> None:
+    """Metrics of one variant at two plant steps; of an unstable one only the onset, to one control period.
+
+    Over the bus every number is a count. Where a rounding falls the other way because of the sixteenth digit, the run
+    goes on by a count apart, so only what the counts do not decide is compared: the verdict and the errors of the tool.
+    """
     assert coarse["stable"] == fine["stable"]
+    if counts:
+        assert coarse["final_error"] == pytest.approx(fine["final_error"], rel=0.02, abs=2e-4) or not coarse["stable"]
+        return
     if not coarse["stable"]:
         assert coarse["unstable_since"] == pytest.approx(fine["unstable_since"], abs=0.010)
         return

@@ -1,10 +1,8 @@
 """What a drive reports: emergency codes and the error register that goes with each."""
 
 from collections.abc import Callable
-from typing import Literal
 
-# Reasons for which a drive gives up on its master, as the node tells them.
-Loss = Literal["heartbeat", "guarding", "nmt_stop", "bus_off", "sync", "rpdo"]
+from lwa4d_sim.bus.device import Loss
 
 # Codes of CiA 301 and 402; all but 8100 and 8140 are in the list of SCHUNK's modules (lwa4d-facts 6.6).
 OVERHEATED = 0x4210

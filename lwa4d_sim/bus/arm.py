@@ -12,12 +12,14 @@ import numpy as np
 
 from lwa4d_sim.bus.dictionary import Joint, drive_dictionary
 from lwa4d_sim.bus.drive import Drive
-from lwa4d_sim.bus.node import Node
+from lwa4d_sim.bus.node import NmtState, Node
 from lwa4d_sim.bus.options import Profile
 from lwa4d_sim.interfaces import NS_PER_S, Array, Ns
 
 START = Ns(0)
-SYNC = 0x080  # CiA 301, predefined connection set
+# Identifiers of CiA 301's predefined connection set.
+NMT, SYNC, FIRST_PDO, LAST_PDO, FIRST_REQUEST, LAST_REQUEST = 0x000, 0x080, 0x181, 0x57F, 0x601, 0x67F
+RPDOS = range(0x1400, 0x1404)
 
 
 class Physics(Protocol):
@@ -33,6 +35,10 @@ class Physics(Protocol):
 
     def hold(self, joints: Any) -> None:
         """Close the brakes of the joints in a mask (n,) and open all others."""
+        ...
+
+    def diverged(self) -> Any:
+        """Mask (1,) when the arm was lost since the last call, or None."""
         ...
 
 
@@ -56,7 +62,7 @@ class BusArm:
         joints: what each drive knows about its joint.
         first_node: node id of the first joint; the others follow.
         profile: which drive (`lwa4d` or `cia402`).
-        source: the drives' speed signal; None = the true speed.
+        source: the speed that the drives report; None = the true one.
         sender: given a node id, what puts that node's frames on the bus.
         epoch: the instant of the plant's first step [ns]; before it the arm stands still.
         per_sync: move the plant on by so much [ns] at each SYNC instead of by the clock.
@@ -93,38 +99,66 @@ class BusArm:
         self.deaf: set[int] = set()
         self._deadlines: list[Ns | None] = [None] * len(joints)
         self._listeners: dict[int, list[int]] = {}
-        self._known: list[frozenset[int]] = []
+        self._settled = self._timed = False
         self._measure()
 
     def power_on(self, now: Ns) -> Ns | None:
         """Switch all drives on; returns the first instant at which `poll` wants to be called."""
+        self._settled = False
         for node in self.nodes:
             node.power_on(now)
         return self.poll(now)
 
     def receive(self, msg: can.Message, now: Ns) -> Ns | None:
-        """Hand a frame to the nodes it concerns; returns as `poll`."""
+        """Hand a frame to the nodes it concerns; returns the next instant at which one of these wants to be polled."""
         if msg.is_extended_id or msg.is_error_frame or msg.is_remote_frame:
-            concerned: Sequence[int] = range(len(self.nodes))
+            concerned: Sequence[int] = [k for k, node in enumerate(self.nodes) if node.node_id not in self.deaf]
+            set_point = False
         else:
-            if msg.arbitration_id == SYNC:
+            cob_id = msg.arbitration_id
+            if cob_id == SYNC:
                 self._syncs += 1
-            concerned = self._concerned(msg.arbitration_id)
+            concerned = self._concerned(cob_id)
+            # only requests and network management move PDOs
+            self._settled = NMT < cob_id < FIRST_REQUEST or cob_id > LAST_REQUEST
+            set_point = FIRST_PDO <= cob_id < LAST_PDO
+        deadline: Ns | None = None
         for k in concerned:
-            self.nodes[k].receive(msg, now)
-            self._deadlines[k] = self.nodes[k].poll(now)
-        return min((t for t in self._deadlines if t is not None), default=None)
+            node = self.nodes[k]
+            node.receive(msg, now)
+            if set_point and not self._timed:
+                continue  # moves no timer
+            self._deadlines[k] = mine = node.poll(now)
+            if mine is not None and (deadline is None or mine < deadline):
+                deadline = mine
+        return deadline
 
     def silence(self, node_id: int, *, deaf: bool) -> None:
         """Cut a node's receiver off the bus, or connect it again."""
         (self.deaf.add if deaf else self.deaf.discard)(node_id)
-        self._known = []
+        self._settled = False
+
+    def switch_on(self, node_id: int, now: Ns) -> Ns | None:
+        """Let one drive start anew; returns as `poll`."""
+        k = self._index(node_id)
+        self.nodes[k].power_on(now)
+        self._deadlines[k] = None
+        return self.poll(now)
+
+    def switch_off(self, node_id: int, now: Ns) -> None:
+        """Take one drive's supply away: its brake closes."""
+        k = self._index(node_id)
+        self.catch_up(now)
+        self.nodes[k].state = NmtState.INITIALISING  # in which it has no timers
+        self.drives[k].reset(now)
+        self._deadlines[k] = None
 
     def poll(self, now: Ns) -> Ns | None:
         """Let the nodes' timers act; returns the next instant at which they want to, or None."""
         for k, deadline in enumerate(self._deadlines):
             if deadline is None or deadline <= now:
                 self._deadlines[k] = self.nodes[k].poll(now)
+                self._settled = False
         return min((t for t in self._deadlines if t is not None), default=None)
 
     def catch_up(self, now: Ns) -> None:
@@ -171,20 +205,30 @@ class BusArm:
         self._step += steps
 
     def _measure(self) -> None:
-        speed = self._plant.dq if self._source is None else self._source.read()
-        for drive, q, dq in zip(self.drives, self._plant.q[0].tolist(), speed[0].tolist(), strict=True):
-            drive.measure(q, dq)
+        # the drives' own loops have the speed at once; its filter is on the way to the bus
+        shown = self._plant.dq if self._source is None else self._source.read()
+        rows = (array[0].tolist() for array in (self._plant.q, self._plant.dq, shown))
+        for drive, q, dq, reported in zip(self.drives, *rows, strict=True):
+            drive.measure(q, dq, reported)
+
+    def _index(self, node_id: int) -> int:
+        return next(k for k, node in enumerate(self.nodes) if node.node_id == node_id)
 
     def _concerned(self, cob_id: int) -> Sequence[int]:
-        """Indices of the nodes that listen to an identifier now; a PDO may have been moved by any frame before this one."""
-        known = [node.cob_ids for node in self.nodes]
-        if any(a is not b for a, b in zip(known, self._known, strict=False)) or len(known) != len(self._known):
-            self._known = known
+        """Indices of the nodes that listen to an identifier now."""
+        if not self._settled:
             self._listeners = {}
-            for k, ids in enumerate(known):
-                for each in ids if self.nodes[k].node_id not in self.deaf else ():
+            self._timed = any(_times_set_points(node) for node in self.nodes)
+            for k, node in enumerate(self.nodes):
+                for each in node.data_ids if node.node_id not in self.deaf else ():
                     self._listeners.setdefault(each, []).append(k)
         return self._listeners.get(cob_id, ())
+
+
+def _times_set_points(node: Node) -> bool:
+    """Whether any RPDO has an event timer (14xx:5)."""
+    values = node.dictionary
+    return any((index, 5) in values and values[index, 5] for index in RPDOS)
 
 
 class _Emergency:

@@ -3,11 +3,12 @@
 import math
 from typing import Any
 
-from lwa4d_sim.bus.dictionary import MDEG_S_PER_RPM, Dictionary, Joint
+from lwa4d_sim.bus.dictionary import Dictionary, Joint
 from lwa4d_sim.bus.motion import Point
 from lwa4d_sim.interfaces import NS_PER_S, Ns
 
 RAD_PER_MDEG = math.pi / 180_000  # positions are millidegrees at the joint (lwa4d-facts, section 3)
+MDEG_S_PER_RPM = 6000  # 6080 is in revolutions per minute of the joint
 MS = 1_000_000  # [ns]
 
 # Reflected rotor inertia per newton metre of peak torque [kg m^2 / (N m)]: 0.19 at the 19 N m of an ERB 115
@@ -27,6 +28,7 @@ class Axis:
 
     Attributes:
         q, dq: measured position [rad] and speed [rad/s].
+        dq_shown: speed as the bus reads it [rad/s].
         tau: torque that acts [N m].
         tau_held: torque with which the loops held the axis when the brake last closed [N m].
         zero: joint angle of the drive's zero [rad]; homing moves it.
@@ -41,7 +43,7 @@ class Axis:
         self.dictionary, self.joint = dictionary, joint
         self.full = (0x605A, 0) in dictionary
         self.inertia = INERTIA_PER_TORQUE * joint.torque if inertia is None else inertia
-        self.q = self.dq = self.zero = 0.0
+        self.q = self.dq = self.dq_shown = self.zero = 0.0
         self.tau = self.tau_held = 0.0
         self.load()
 
@@ -70,9 +72,7 @@ class Axis:
         self.speed_max = min(get(0x607F) * RAD_PER_MDEG or math.inf, motor)
         if self.speed_max == math.inf:
             self.speed_max = joint.speed
-        # ASSUMED: a torque mode watches the speed only when 6080 was set below what the joint is rated for, since
-        # then the drive must look at every instant
-        self.speed_guard = motor if motor < joint.speed else math.inf
+        self.speed_guard = motor  # in torque modes; with it the drive must look at every instant
         self.profile_speed = min(max(get(0x6081) * RAD_PER_MDEG, SLOWEST), self.speed_max)
         fastest = (get(0x60C5) * RAD_PER_MDEG or math.inf, get(0x60C6) * RAD_PER_MDEG or math.inf)
         acceleration = get(0x6083) * RAD_PER_MDEG or joint.acceleration

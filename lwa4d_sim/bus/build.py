@@ -4,17 +4,22 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from lwa4d_sim.assembly import Blocks
 from lwa4d_sim.bus.arm import BusArm
+from lwa4d_sim.bus.checks import check_bus
 from lwa4d_sim.bus.connect import Connection
 from lwa4d_sim.bus.dictionary import Joint
+from lwa4d_sim.bus.faults import Faults
 from lwa4d_sim.bus.joints import joints_for
 from lwa4d_sim.bus.master import Master, Plan
 from lwa4d_sim.bus.options import FIRST_NODE
-from lwa4d_sim.bus.safety import Envelope
+from lwa4d_sim.bus.safety import Envelope, Following
 from lwa4d_sim.bus.session import Session
 from lwa4d_sim.bus.simulation import STARTUP, Simulation, add_traffic
 from lwa4d_sim.bus.wire import BitErrors, Wire
+from lwa4d_sim.dynamics import Dynamics
 from lwa4d_sim.interfaces import NS_PER_S, Estimator, Ns, to_ns
 from lwa4d_sim.loop import Tick
 from lwa4d_sim.mjcf import joint_facts
@@ -50,12 +55,16 @@ def canopen_run(blocks: Blocks) -> tuple[Simulation, Iterator[Tick]]:
     source, estimator = _speed(blocks, loop)
     errors = BitErrors(probability=loop.noise.per_bit) if loop.noise.per_bit else None
     seed = blocks.infos[0].seed
+    plan = plan_for(blocks, loop)
+    check_bus(plan, loop.bit_rate, loop.traffic)
     wire = Wire(loop.bit_rate, start=STARTUP, errors=errors, seed=seed, record=True)
     add_traffic(wire, loop.traffic)
-    plan = plan_for(blocks, loop)
     simulation = Simulation(wire, blocks.plant, plan.joints, loop.profile, source)
+    _tune(simulation.arm, blocks)
+    Faults(simulation, plan, loop.bit_rate, loop.faults)
     control = blocks.control(estimator)
-    return simulation, simulation.run(plan, control, blocks.timing, with_speed=source is not None)
+    ticks = simulation.run(plan, control, blocks.timing, with_speed=source is not None, following=_following(blocks))
+    return simulation, ticks
 
 
 def served_arm(blocks: Blocks, bus: Connection, *, epoch: Ns, per_sync: bool) -> BusArm:
@@ -63,7 +72,9 @@ def served_arm(blocks: Blocks, bus: Connection, *, epoch: Ns, per_sync: bool) ->
     loop = bus_loop(blocks.settings)
     source, _ = _speed(blocks, loop)
     step = to_ns(loop.period) if per_sync else None
-    return BusArm(blocks.plant, _joints(blocks), FIRST_NODE, loop.profile, source, lambda node: bus.send, epoch, step)
+    arm = BusArm(blocks.plant, _joints(blocks), FIRST_NODE, loop.profile, source, lambda node: bus.send, epoch, step)
+    _tune(arm, blocks)
+    return arm
 
 
 def driving_session(
@@ -73,9 +84,30 @@ def driving_session(
     loop = bus_loop(blocks.settings)
     source, estimator = _speed(blocks, loop)
     plan = plan_for(blocks, loop, enable=enable)
+    check_bus(plan, loop.bit_rate, loop.traffic)
     master = Master(bus, clock, plan)
     control = blocks.control(estimator)
-    return master, Session(master, control, with_speed=source is not None, guard=Envelope(plan.joints))
+    guard = Envelope(plan.joints)
+    following = _following(blocks)
+    return master, Session(master, control, with_speed=source is not None, guard=guard, following=following)
+
+
+def _following(blocks: Blocks) -> Following | None:
+    loop = bus_loop(blocks.settings)
+    if loop.following_error is None:
+        return None
+    names = [joint.name for joint in _joints(blocks)]
+    return Following(blocks.infos[0].trajectory, loop.period, loop.following_error, names)
+
+
+def _tune(arm: BusArm, blocks: Blocks) -> None:
+    """Tune each drive's own loops for what it moves at the start, the other joints free (assumed).
+
+    On an arm without rotor inertia the joints are so strongly coupled that this serves to stop, not for fine motion.
+    """
+    inertia = 1 / np.diag(np.linalg.inv(Dynamics(blocks.model).M(blocks.q0[0])))
+    for drive, own in zip(arm.drives, inertia.tolist(), strict=True):
+        drive.axis.inertia = own
 
 
 def _joints(blocks: Blocks) -> tuple[Joint, ...]:

@@ -1,7 +1,7 @@
 """Finds, checks and sets up the drives, up to switched on with closed brakes.
 
-The order is the thesis's (Table 3.3): PDOs and parameters, mode by SDO, NMT start, controlwords 0x06 and 0x07. 0x0F comes
-with the first torque.
+The order is the thesis's (Table 3.3): PDOs and parameters, mode by SDO, NMT start, controlwords 0x06 and 0x07. 0x0F
+comes with the first torque.
 """
 
 import struct
@@ -16,6 +16,10 @@ START = 0x01  # NMT command
 SHUTDOWN, FAULT_RESET = 0x06, 0x80  # CiA 402 controlwords
 READY, SWITCHED_ON = 0x21, 0x23  # statuswords under the mask
 SYNCHRONOUS, EVENT = 1, 255  # PDO transmission types
+ANOTHER = Ns(5_000_000)  # [ns] in which a second device with an id would have answered too (assumed)
+# A drive misses its set-points as it misses SYNC: after six periods (200E of the LWA4D, lwa4d-facts 6.4).
+TIME_OUT = 6
+ABSENT = (0x06020000, 0x06090011)  # SDO aborts: no such object, no such sub-index
 
 
 def commission(master: Master, parameters: Sequence[tuple[Key, str, float]] = ()) -> None:
@@ -44,12 +48,21 @@ def commission(master: Master, parameters: Sequence[tuple[Key, str, float]] = ()
     _reach(master, FAULT_RESET, lambda status: not status & FAULT)
     _reach(master, SHUTDOWN, lambda status: status & STATE_MASK == READY)
     _reach(master, SWITCH_ON, lambda status: status & STATE_MASK == SWITCHED_ON)
+    for station in master.stations:
+        _time_out(master, station)
     master.watch.enabled = False
 
 
 def _identify(master: Master, station: Station) -> None:
-    node = station.node
+    node, answered = station.node, station.answers
     device = int.from_bytes(master.client.read(node, 0x1000), "little")
+    master.wait(Ns(master.clock() + ANOTHER))
+    if station.answers > answered + 1:
+        raise BusError(f"node {node}: two answers to one request; two devices have this node id")
+    if station.boots > 1:
+        raise BusError(
+            f"node {node}: has started {station.boots} times; two devices have this node id, or its supply fails"
+        )
     if device & 0xFFFF != 402:
         raise BusError(f"node {node}: is no drive: device type 0x{device:08X}, expected profile 402")
     modes = int.from_bytes(master.client.read(node, 0x6502), "little")
@@ -66,7 +79,9 @@ def _set_up(master: Master, station: Station, parameters: Sequence[tuple[Key, st
     if master.plan.heartbeat:
         consumer = MASTER_NODE << 16 | 3 * master.plan.heartbeat
         write(node, 0x1016, 1, struct.pack("<I", consumer))
-    write(node, 0x60C2, 1, struct.pack("<B", min(255, max(1, round(master.plan.period / 1e6)))))
+    count, exponent = interpolation_period(master.plan.period)
+    write(node, 0x60C2, 1, struct.pack("<B", count))
+    write(node, 0x60C2, 2, struct.pack("<b", exponent))
     receive_type = EVENT if master.plan.immediate else SYNCHRONOUS
     for i, mapping in enumerate(master.layout.receive):
         _map(master, node, 0x1400 + i, 0x200 + 0x100 * i + node, receive_type, mapping)
@@ -75,6 +90,35 @@ def _set_up(master: Master, station: Station, parameters: Sequence[tuple[Key, st
     for (index, sub), form, value in parameters:
         write(node, index, sub, struct.pack(form, value))
     write(node, 0x6060, 0, struct.pack("<b", master.layout.mode))
+    for _ in range(TRIES):
+        (mode,) = struct.unpack("<b", master.client.read(node, 0x6061))
+        if mode == master.layout.mode:
+            return
+        master.wait(Ns(master.clock() + master.plan.period))
+    raise BusError(f"node {node}: does not change to mode {master.layout.mode}; 0x6061 says {mode}")
+
+
+def interpolation_period(period: Ns) -> tuple[int, int]:
+    """A SYNC period as 60C2 has it: a number up to 255, and the power of ten [s] that it counts.
+
+    Raises:
+        BusError: it cannot be said so.
+    """
+    for exponent in (-3, -4, -5, -6):
+        count, rest = divmod(period, 10 ** (9 + exponent))
+        if not rest and count <= 255:
+            return count, exponent
+    raise BusError(f"a drive cannot be told a period of {period / 1e6:g} ms: 60C2 has three digits up to 255")
+
+
+def _time_out(master: Master, station: Station) -> None:
+    """Let the drive miss its set-points (1400:5), if it can; the time begins with the next RPDO."""
+    milliseconds = max(1, round(TIME_OUT * master.plan.period / 1e6))
+    try:
+        master.client.write(station.node, 0x1400, 5, struct.pack("<H", min(milliseconds, 0xFFFF)))
+    except BusError as error:
+        if getattr(error.__cause__, "code", None) not in ABSENT:
+            raise
 
 
 def _map(

@@ -130,10 +130,11 @@ def broken(msg: can.Message, bit: int, *, flag: int = 0, local: bool = False) ->
     else:
         seen = sent[: bit + 1]
         seen[bit] ^= not local
-        run = 0  # bits before the flag that already have its level
-        while run < FLAG_BITS and run <= bit and seen[bit - run] == flag:
+        run = 1
+        while run < FLAG_BITS and run <= bit and seen[bit - run] == seen[bit]:
             run += 1
-        lag = FLAG_BITS - run  # flag bits that pass before receivers begin theirs
+        # Flag bits that pass before receivers, who wait for six equal ones, begin their flags.
+        lag = 0 if run == FLAG_BITS else FLAG_BITS - (run if seen[bit] == flag else 0)
         if local:  # and before the other transmitter does
             lag = max(lag, next(k for k in range(1, len(sent)) if sent[bit + k] != flag))
         if not flag:

@@ -1,5 +1,6 @@
 """Opens a bus of python-can by name, and keeps its quirks out of the rest."""
 
+import time
 from collections import deque
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,11 @@ import can
 from lwa4d_sim.errors import BusError
 
 RECENT = 256  # own frames remembered, to tell their echoes (assumed: many cycles' worth)
+# Frames in a row that are skipped as echoes or unreadable before `recv` comes back empty-handed (assumed), so that
+# nobody who floods the bus with them keeps the caller from its other work.
+SKIPPED = 512
+
+_Key = tuple[int, bool, bool, bytes]
 
 
 class Connection:
@@ -19,53 +25,115 @@ class Connection:
     Args:
         bus: the bus.
         echoes: whether the bus hands back what was sent.
+
+    Attributes:
+        channel_info: of the bus.
+        unreadable: datagrams that were no frame of a classic CAN bus.
+        loggers: each is given all frames, sent and received, with the wall clock as time stamp. One that fails is
+            given up: the bus is more important.
+        log_error: why a logger was given up, or None.
     """
 
     def __init__(self, bus: can.BusABC, *, echoes: bool) -> None:
         self._bus, self._echoes = bus, echoes
-        self._sent: deque[tuple[int, bytes]] = deque(maxlen=RECENT)
+        self._sent: deque[_Key] = deque()
+        self._pending: dict[_Key, int] = {}
         self.channel_info = bus.channel_info
         self.unreadable = 0
         self.loggers: list[can.Listener] = []
+        self.log_error: str | None = None
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Put a frame on the bus."""
         if self._echoes:
-            self._sent.append((msg.arbitration_id, bytes(msg.data)))
-        for logger in self.loggers:
-            logger(msg)
+            key = _key(msg)
+            self._sent.append(key)
+            self._pending[key] = self._pending.get(key, 0) + 1
+            if len(self._sent) > RECENT:
+                self._forget()
+        if self.loggers:
+            self._log(_stamped(msg))
         self._bus.send(msg, timeout)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next frame of others, or None after ``timeout`` [s]; an echo or an unreadable frame also gives None."""
-        try:
-            msg = self._bus.recv(timeout)
-        except can.CanOperationError:
-            raise
-        except (ValueError, TypeError, KeyError, IndexError, can.CanError):  # what a hostile datagram can cause
-            self.unreadable += 1
-            return None
-        if msg is None:
-            return None
-        if self._echoes and self._is_echo(msg):
-            return None
-        for logger in self.loggers:
-            logger(msg)
-        return msg
+        """The next frame of others, or None after ``timeout`` [s]."""
+        end = None if timeout is None else time.monotonic() + timeout
+        for _ in range(SKIPPED):
+            try:
+                msg = self._bus.recv(timeout)
+            except can.CanOperationError as error:
+                if not _is_about_content(error):
+                    raise
+                self.unreadable += 1
+            except (ValueError, TypeError, KeyError, IndexError):
+                self.unreadable += 1
+            else:
+                if msg is None:
+                    return None
+                if type(msg.arbitration_id) is not int or msg.is_fd:
+                    self.unreadable += 1
+                elif not (self._pending and self._is_echo(msg)):
+                    if self.loggers:
+                        self._log(msg)
+                    return msg
+            if end is not None:
+                timeout = max(0.0, end - time.monotonic())
+        return None
 
     def shutdown(self) -> None:
         """Close the bus and the logs."""
+        self._bus.shutdown()
         for logger in self.loggers:
             logger.stop()
-        self._bus.shutdown()
+
+    def _log(self, msg: can.Message) -> None:
+        for logger in list(self.loggers):
+            try:
+                logger(msg)
+            except Exception as error:  # a full disk must not stop the arm's cycle
+                self.loggers.remove(logger)
+                self.log_error = str(error)
 
     def _is_echo(self, msg: can.Message) -> bool:
-        key = (msg.arbitration_id, bytes(msg.data))
-        if key not in self._sent:
+        key = _key(msg)
+        if key not in self._pending:
             return False
-        while self._sent.popleft() != key:
+        while self._forget() != key:
             pass  # an earlier own frame was lost on the way back
         return True
+
+    def _forget(self) -> _Key:
+        """No longer expect the oldest of the echoes."""
+        key = self._sent.popleft()
+        left = self._pending[key] - 1
+        if left:
+            self._pending[key] = left
+        else:
+            del self._pending[key]
+        return key
+
+
+def _key(msg: can.Message) -> _Key:
+    return msg.arbitration_id, msg.is_extended_id, msg.is_remote_frame, bytes(msg.data)
+
+
+def _is_about_content(error: can.CanOperationError) -> bool:
+    """Whether one datagram was bad, not the bus: python-can reports both alike, but for what caused it."""
+    return error.__cause__ is not None and not isinstance(error.__cause__, OSError)
+
+
+def _stamped(msg: can.Message) -> can.Message:
+    """A frame that is being sent, as it is to be logged."""
+    return can.Message(
+        timestamp=time.time(),
+        arbitration_id=msg.arbitration_id,
+        is_extended_id=msg.is_extended_id,
+        is_remote_frame=msg.is_remote_frame,
+        is_error_frame=msg.is_error_frame,
+        dlc=msg.dlc,
+        data=msg.data,
+        is_rx=False,
+    )
 
 
 def connect(interface: str, channel: str, bit_rate: int | None = None) -> Connection:
@@ -73,7 +141,8 @@ def connect(interface: str, channel: str, bit_rate: int | None = None) -> Connec
 
     Args:
         interface: python-can's name: virtual, udp_multicast, socketcan, ...
-        channel: what the interface calls a channel: vcan0, 239.74.163.2, ...
+        channel: what the interface calls a channel: vcan0, 239.74.163.2, ... A port may follow the group of
+            udp_multicast, as in 239.74.163.2:43114: who uses one port hears every group that the machine listens to.
         bit_rate: [bit/s], for interfaces that set it.
 
     Raises:
@@ -85,11 +154,14 @@ def connect(interface: str, channel: str, bit_rate: int | None = None) -> Connec
     options: dict[str, Any] = {}
     if interface == "udp_multicast":
         options = {"hop_limit": 0, "fd": False}  # stay on this machine
+        group, colon, port = channel.rpartition(":")
+        if colon and ":" not in group and port.isdecimal():
+            channel, options["port"] = group, int(port)
     elif bit_rate is not None and interface != "virtual":
         options = {"bitrate": bit_rate}
     try:
         bus = can.Bus(channel=channel, interface=interface, **options)
-    except (can.CanError, OSError, ValueError, TypeError, ImportError, AttributeError) as error:
+    except (can.CanError, OSError, ValueError, TypeError, ImportError, AttributeError, OverflowError) as error:
         reason = str(error) or type(error).__name__
         raise BusError(f"cannot open {interface} channel '{channel}': {' '.join(reason.split())}") from error
     return Connection(bus, echoes=interface == "udp_multicast")
@@ -103,7 +175,16 @@ def log_to(bus: Connection, path: Path | None) -> None:
     """
     if path is None:
         return
+    bus.loggers.append(frame_writer(path))
+
+
+def frame_writer(path: Path) -> can.Listener:
+    """A file of frames, in the format its ending names.
+
+    Raises:
+        BusError: no such format, a library for it is missing, or the file cannot be written.
+    """
     try:
-        bus.loggers.append(can.Logger(path))
-    except (ValueError, OSError) as error:
+        return can.Logger(path)
+    except (ValueError, OSError, ImportError, NotImplementedError) as error:
         raise BusError(f"{path}: cannot log frames: {error}") from error

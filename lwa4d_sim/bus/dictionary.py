@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -26,7 +26,6 @@ GROUPS: dict[Group, range] = {  # CiA 301, 7.4.1
 }
 
 MDEG_PER_RAD = 180_000 / math.pi
-MDEG_S_PER_RPM = 6000
 FLOAT_MAX = 3.4028234663852886e38  # largest finite REAL32
 
 # Data types of the tables.
@@ -96,6 +95,7 @@ class Dictionary:
         """Set what a parameter is after power-on, and now."""
         self[key] = default
         self._defaults[key] = self.values[key]
+        self._entries[key] = replace(self._entries[key], default=self.values[key])
 
     def read(self, index: int, sub: int) -> bytes:
         """A value as the bus sees it.
@@ -193,8 +193,7 @@ def drive_dictionary(profile: Literal["lwa4d", "cia402"], node_id: int, joint: J
         "low": -(1 << 31) if joint.low is None else round(joint.low * MDEG_PER_RAD),
         "high": (1 << 31) - 1 if joint.high is None else round(joint.high * MDEG_PER_RAD),
         "torque": round(joint.torque * 1000),
-        "current": round(joint.torque / joint.torque_constant * 1000),
-        "rpm": math.ceil(joint.speed * MDEG_PER_RAD / MDEG_S_PER_RPM),
+        "current": math.ceil(joint.torque / joint.torque_constant * 1000),
     }
     tables = [FIRMWARE, pdo_rows(FIRMWARE_PDOS, extended=False)]
     if profile == "cia402":

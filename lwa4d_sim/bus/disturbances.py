@@ -122,10 +122,12 @@ class Disturbances:
         self.law = errors or BitErrors(probability=0)
         self._gap = self.law.gap(self._rng)
 
-    @property
-    def expected(self) -> bool:
-        """Whether any transmission may be disturbed."""
-        return bool(self.law.probability or self.script)
+    def passes(self, bits: int) -> bool:
+        """Whether chance spares the next bits; only then do they count as gone by."""
+        if self._gap < bits:
+            return False
+        self._gap -= bits
+        return True
 
     def judge(self, contenders: Sequence[Pending], nodes: Sequence[WirePort]) -> Verdict:
         """Say how a transmission will end that these frames, equal in arbitration, begin together."""
@@ -152,8 +154,7 @@ class Disturbances:
         return verdict
 
     def _by_chance(self, bits: int, others: Sequence[WirePort]) -> tuple[int, str | None] | None:
-        if self._gap >= bits:
-            self._gap -= bits
+        if self.passes(bits):
             return None
         bit, self._gap = self._gap, self.law.gap(self._rng)
         local = others and self._rng.random() < self.law.local

@@ -11,6 +11,7 @@ from lwa4d_sim.bus import alarms
 from lwa4d_sim.bus.axis import RAD_PER_MDEG, Axis
 from lwa4d_sim.bus.brake import Brake
 from lwa4d_sim.bus.cia402 import BLOCKED, DEVIATION, ENERGISED, LIMITED, Command, State
+from lwa4d_sim.bus.device import Loss
 from lwa4d_sim.bus.dictionary import Dictionary, Joint
 from lwa4d_sim.bus.entry import INVALID, Abort
 from lwa4d_sim.bus.gauges import HOT, Gauges
@@ -45,8 +46,7 @@ class Drive:
         encoder_stuck: fault to be injected: the position stays as it is read, the speed is zero.
         brake: its ``works`` is the other fault to be injected.
         axis: the joint in the drive's eyes; its ``inertia`` may be changed at any time.
-        gauges: temperature and what else the drive shows.
-        steering: power state, mode and who has the axis.
+        gauges, steering: what the drive shows; and power state, mode, who has the axis.
     """
 
     def __init__(
@@ -90,14 +90,14 @@ class Drive:
 
     # What the plant asks
 
-    def measure(self, q: float, dq: float) -> None:
-        """Take the joint angle [rad] and the drive's speed signal [rad/s]."""
+    def measure(self, q: float, dq: float, shown: float | None = None) -> None:
+        """Take the joint's angle [rad] and speed [rad/s], and the speed that 606C is to show, if it is another."""
         axis = self.axis
         if self.encoder_stuck:
-            axis.dq = 0.0
+            axis.dq = axis.dq_shown = 0.0
         elif math.isfinite(q) and math.isfinite(dq):
             axis.q = round(q / RAD_PER_MDEG) * RAD_PER_MDEG - axis.zero
-            axis.dq = dq
+            axis.dq, axis.dq_shown = dq, dq if shown is None else shown
             self._blind = False
         else:
             self._blind = True
@@ -106,21 +106,21 @@ class Drive:
     def torque(self, now: Ns, dt: float) -> float:
         """Torque [N m] for the next plant step of ``dt`` [s]."""
         axis = self.axis
-        if self.steady:
-            return axis.tau
-        if self.brake.opened(now):
-            self.steering.opened(now)
-        axis.tau = self._loops(now, dt)
+        if not self.steady:
+            if self.brake.opened(now):
+                self.steering.opened(now)
+            axis.tau = self._loops(now, dt)
         return axis.tau
 
     def _loops(self, now: Ns, dt: float) -> float:
         """One round of the loops that are closed."""
         axis, steering = self.axis, self.steering
-        mode = steering.mode
         if self.brake.closed:
             return 0.0
+        mode = steering.mode
         offset, excess, position, code = 0.0, 0.0, True, 0
-        if steering.why is Why.RUN:
+        stopping = steering.why is not Why.RUN
+        if not stopping:
             if mode.loop is Loop.TORQUE:
                 self._supervision.forget()
                 self._settle(now)
@@ -133,7 +133,7 @@ class Drive:
                 self._settle(now)
                 return self._loops(now, dt)
             ref = steering.stop.at(now)
-        tau = self._servo.torque(ref, offset, dt, position=position)
+        tau = self._servo.torque(ref, offset, dt, position=position, stopping=stopping)
         if not math.isfinite(tau):
             self._servo.preset(0.0)
             code = alarms.PARAMETER
@@ -150,10 +150,8 @@ class Drive:
         low = -high
         if axis.speed_guard < math.inf:
             stiffness = axis.inertia * GAINS[0x2020]
-            high, low = (
-                min(max(stiffness * (axis.speed_guard - axis.dq), low), high),
-                max(min(-stiffness * (axis.speed_guard + axis.dq), high), low),
-            )
+            high = min(max(stiffness * (axis.speed_guard - axis.dq), low), high)
+            low = max(min(-stiffness * (axis.speed_guard + axis.dq), high), low)
         self._clipped = not low <= tau <= high
         return min(max(tau, low), high)
 
@@ -180,9 +178,9 @@ class Drive:
 
     def refresh(self) -> None:
         """Actual values and statusword into the dictionary."""
-        now, axis, gauges, steering = self._now, self.axis, self.gauges, self.steering
-        gauges.heat(axis.tau, now)
-        if gauges.temperature >= HOT:
+        now, axis, steering = self._now, self.axis, self.steering
+        self.gauges.heat(axis.tau, now)
+        if self.gauges.temperature >= HOT:
             self.fail(alarms.OVERHEATED)
         ref, error = steering.reference(now)
         bits = steering.status(now)
@@ -192,7 +190,7 @@ class Drive:
             bits |= LIMITED
         if self._servo.saturated and axis.standing and not axis.full:
             bits |= BLOCKED
-        gauges.show(steering.machine.state, bits, ref, error)
+        self.gauges.show(steering.machine.state, bits, ref, error)
 
     def written(self, index: int, sub: int) -> None:
         """React to a write from the bus.
@@ -201,17 +199,18 @@ class Drive:
             Abort: a mode, homing method or gain that the drive does not have.
         """
         now, dictionary, steering = self._now, self._dictionary, self.steering
+        value = dictionary[index, sub]
         if index == 0x6040:
-            word = dictionary[0x6040, 0]
-            if word != steering.word or steering.why is not Why.RUN:
-                self._control(word, now)
+            if value != steering.word or steering.why is not Why.RUN:
+                self._control(value, now)
             return
         if index in SET_POINTS:
-            if steering.why is Why.RUN and not self.brake.closed:
-                steering.mode.write(index, now)
-                self._settle(now)
+            mode = steering.mode
+            if index in mode.set_points and steering.why is Why.RUN and not self.brake.closed:
+                mode.write(index, now)
+                if mode.loop is Loop.TORQUE:
+                    self._settle(now)
             return
-        value = dictionary[index, sub]
         if index == 0x6060:
             if not steering.has(value):
                 raise Abort(INVALID)
@@ -230,7 +229,7 @@ class Drive:
             self._faults.recovered(alarms.SYNC_LOST)
         self.steering.sync(now)
 
-    def lost(self, reason: alarms.Loss, now: Ns) -> None:
+    def lost(self, reason: Loss, now: Ns) -> None:
         """The master is lost: abort connection option 6007, in the firmware always a quick stop."""
         option = self.axis.get(0x6007, default=3)
         if option == 1:

@@ -52,7 +52,7 @@ class Gauges:
         axis = self._axis
         dictionary = axis.dictionary
         position, speed = axis.position_count, axis.speed_count
-        q, dq, tau = axis.q, axis.dq, axis.tau
+        q, dq, tau = axis.q, axis.dq_shown, axis.tau
         torque = tau / axis.newton_metres
         word = state.bits | VOLTAGE | bits
         if self.temperature >= WARM:

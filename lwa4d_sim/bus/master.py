@@ -28,7 +28,7 @@ from lwa4d_sim.errors import BusError
 from lwa4d_sim.interfaces import NS_PER_S, Array, Ns
 
 NMT, SYNC = 0x000, 0x080  # CiA 301, predefined connection set
-START, PRE_OPERATIONAL = 0x01, 0x80  # NMT commands
+START, STOP, PRE_OPERATIONAL = 0x01, 0x02, 0x80  # NMT commands
 SHUTDOWN, SWITCH_ON, QUICK_STOP, DISABLE_VOLTAGE, FAULT_RESET = 0x06, 0x07, 0x02, 0x00, 0x80  # CiA 402 controlwords
 # Statusword under the mask. A drive in fault or after a quick stop has bit 6 or 5 of its own.
 STATE_MASK, READY, SWITCHED_ON, ENABLED, QUICK_STOP_ACTIVE = 0x6F, 0x21, 0x23, 0x27, 0x07
@@ -37,6 +37,7 @@ MASTER_NODE = 127  # as which the master's heartbeat is heard (schunk_pg70, Schu
 HEARTBEAT_MS = 100  # LWA 4P's DCF; the LWA4D's leaves it off
 TRIES = 50  # SYNC cycles a state change may take (assumed)
 SYNCHRONOUS, EVENT = 1, 255  # PDO transmission types
+OVERTIME = 1_000_000  # [ns] for which frames that had arrived are taken in beyond an instant, were it a flood (assumed)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,19 +121,22 @@ class Master:
             raise BusError(f"cannot send on {self.bus.channel_info}: {error}") from error
 
     def wait(self, until: Ns, done: Callable[[], bool] | None = None) -> bool:
-        """Take in what the bus brings until a condition holds or the instant has come; says whether it held."""
+        """Take in what the bus brings until a condition holds or the instant has come; says whether it held.
+
+        What had arrived by then is taken in too, or it would pass for the next cycle's.
+        """
         while done is None or not done():
             left = until - self.clock()
-            if left <= 0 and done is None:
-                return False
             try:
                 msg = self.bus.recv(max(left, 0) / NS_PER_S)
             except can.CanError as error:
                 raise BusError(f"cannot receive from {self.bus.channel_info}: {error}") from error
             if msg is not None:
                 self._take(msg)
-            elif left <= 0:
-                return bool(done())  # type: ignore[misc]
+                if left > -OVERTIME:
+                    continue
+            if self.clock() >= until:
+                return done is not None and done()
         return True
 
     def frame(self, cob_id: int, data: bytes) -> None:
@@ -140,24 +144,33 @@ class Master:
 
     def _take(self, msg: can.Message) -> None:
         if msg.is_error_frame or msg.is_extended_id or msg.is_remote_frame:
-            self.watch.odd(msg)
+            self.watch.odd(msg, self.clock())
             return
         found = self._cob.get(msg.arbitration_id)
         if found is None:
             if 0x580 < msg.arbitration_id < 0x600:
+                if msg.arbitration_id - 0x580 in self._by_node:
+                    self._by_node[msg.arbitration_id - 0x580].answers += 1
                 self.client.notify(msg.arbitration_id, bytearray(msg.data), msg.timestamp)
             else:
                 self.watch.heard(msg, self.clock(), self.sync_at)
             return
         station, mapping, bit = found
         if len(msg.data) < mapping.size:
-            self.watch.short(station, msg)
+            self.watch.ignored(station, f"TPDO of {len(msg.data)} bytes ignored", self.clock())
             return
+        if station.fresh & bit:
+            # Frames have no number. One kind keeps its order on the wire, so the second is newer only if the first
+            # was that of the cycle before; else it is a copy, or older.
+            if not station.owed & bit:
+                self.watch.ignored(station, "a second TPDO in one cycle ignored", self.clock())
+                return
+            station.owed &= ~bit
         station.values.update(mapping.unpack(msg.data))
-        if not station.fresh & bit:
-            station.fresh |= bit
-            if station.fresh == self._all:
-                self._waiting -= 1
+        station.fresh |= bit
+        if station.fresh == self._all and not station.owed and not station.complete:
+            station.complete = True
+            self._waiting -= 1
         if bit == 1:
             station.stamp, station.since = self.sync_at, self.clock()
 
@@ -166,7 +179,8 @@ class Master:
     def sync(self) -> None:
         """Begin a cycle: SYNC, and the master's heartbeat when it is due."""
         for station in self.stations:
-            station.fresh = 0
+            station.owed = 0 if station.stamp == NEVER else self._all & ~station.fresh
+            station.fresh, station.complete = 0, False
         self._waiting = len(self.stations)
         self.sync_at = self.clock()
         self.frame(SYNC, b"")
@@ -175,7 +189,10 @@ class Master:
             self._beat = Ns(self.sync_at + self.plan.heartbeat * 1_000_000)
 
     def gather(self) -> bool:
-        """Wait until every drive has sent its measurements, at most until the deadline; says whether all have."""
+        """Wait until every drive has sent its measurements, at most until the deadline; says whether all have.
+
+        After a cycle in which a TPDO did not come, the next may be the late one, and it is worth waiting for another.
+        """
         complete = self.wait(Ns(self.sync_at + self.plan.deadline), lambda: not self._waiting)
         for station in self.stations:
             station.missed = 0 if station.fresh & 1 else station.missed + 1
@@ -202,8 +219,13 @@ class Master:
     # -- the end -----------------------------------------------------------------------------------------------------
 
     def halt(self) -> None:
-        """One step towards standstill: quick stop to the drives that move, no voltage to those that have stopped."""
+        """One step towards standstill: quick stop to the drives that move, no voltage to those that have stopped.
+
+        A drive that sends no measurements may not take set-points either. NMT stop makes it stop by itself (6007).
+        """
         for station in self.stations:
+            if station.missed:
+                self.frame(NMT, bytes([STOP, station.node]))
             moving = station.status & STATE_MASK in (ENABLED, QUICK_STOP_ACTIVE)
             station.values[CONTROL] = QUICK_STOP if moving else DISABLE_VOLTAGE
             station.values[self.layout.torque] = 0
@@ -229,5 +251,7 @@ class Master:
         self.command(None, DISABLE_VOLTAGE)
         self.sync()
         for station in self.stations:
+            if station.missed:
+                self.frame(NMT, bytes([STOP, station.node]))
             self.frame(NMT, bytes([PRE_OPERATIONAL, station.node]))
         self.wait(Ns(self.clock() + self.plan.period))

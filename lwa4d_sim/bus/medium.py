@@ -55,6 +55,7 @@ class Medium:
         self._disturbances = Disturbances(errors, seed)
         self._ports: tuple[WirePort, ...] = ()
         self._nodes: tuple[WirePort, ...] = ()  # the ports that are not bus-off
+        self._hearers: tuple[WirePort, ...] = ()  # those of them that want to have the frames
         self._queue: list[tuple[int, int, Pending]] = []  # frames in the arbitration: at most one a port and lane
         self._sequence = 0
         self._frame: Pending | None = None  # on the wire
@@ -76,10 +77,11 @@ class Medium:
     def _watch(self) -> None:
         """Look again at who takes part, and whether all is well."""
         self._nodes = tuple(port for port in self._ports if not port.counters.off)
+        self._hearers = tuple(port for port in self._nodes if port.hears)
         self._alert = not self._ideal and (
             len(self._nodes) < 2
             or bool(self._recovering)
-            or self._disturbances.expected
+            or bool(self._disturbances.script)
             or any(port.tec or port.rec for port in self._nodes)
         )
         self._free = self._idle  # whoever made others wait may be gone
@@ -107,13 +109,14 @@ class Medium:
         """The most urgent frame goes on the wire."""
         queue = self._queue
         frame = heappop(queue)[2]
-        if self._alert or (queue and queue[0][0] == frame.key):
+        bits = frame.bits - INTERFRAME_BITS
+        if self._alert or (queue and queue[0][0] == frame.key) or not self._disturbances.passes(bits):
             self._start_on_alert(frame)
             return
         frame.started = self.now
         frame.attempt += 1
         self._frame = frame
-        self._end = self.now + (frame.bits - INTERFRAME_BITS) * self._num // self._den
+        self._end = self.now + bits * self._num // self._den
 
     def _arrive(self, frame: Pending) -> None:
         """A frame that met no error is through."""
@@ -125,7 +128,7 @@ class Medium:
         if self._record:
             self._note(frame, "sent", now)
         msg.timestamp = now / NS_PER_S
-        for other in self._nodes:
+        for other in self._hearers:
             if other is not port:
                 other.take(msg, now)
 
@@ -206,7 +209,8 @@ class Medium:
             recovery.timer.cancel()
         self._watch()
         for port in receivers:
-            port.take(msg, now)
+            if port.hears:
+                port.take(msg, now)
         for port in changed:
             port.tell(ERROR_BUS_OFF if port.counters.off else ERROR_CONTROLLER, now)
 

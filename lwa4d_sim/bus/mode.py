@@ -46,6 +46,7 @@ class Mode:
     Attributes:
         number: value of 6060.
         loop: loops closed.
+        set_points: objects whose writing moves it.
         limited: a set-point was beyond a limit and is not followed as it came.
         excess: how far the position asked for lies beyond the reference [rad]: it counts as following error.
         motion: the reference.
@@ -53,6 +54,7 @@ class Mode:
 
     number = 0
     loop = Loop.POSITION
+    set_points: frozenset[int] = frozenset()
 
     def __init__(self, axis: Axis) -> None:
         self.axis = axis
@@ -76,7 +78,7 @@ class Mode:
         self.word = word
 
     def write(self, index: int, now: Ns) -> None:
-        """An object that carries set-points was written."""
+        """One of the ``set_points`` was written."""
 
     def demand(self, now: Ns) -> Point:
         """Reference at an instant."""

@@ -35,9 +35,6 @@ CONTROLLER, BUS_OFF, RESTARTED = 0x004, 0x040, 0x100
 OVERFLOWS, PASSIVE, ACTIVE = 0x03, 0x30, 0x40
 
 
-__all__ = ["Device", "Loss", "NmtState", "Node"]
-
-
 class Node:
     """One slave. It does no input or output and reads no clock: frames and time are handed in, frames are handed out.
 
@@ -52,6 +49,7 @@ class Node:
     Attributes:
         state: of network management.
         cob_ids: the 11-bit identifiers it listens to at present; another object after each change.
+        data_ids: those of them of which data frames matter; the others are answered as remote frames only.
     """
 
     def __init__(
@@ -62,6 +60,7 @@ class Node:
         self.node_id, self.dictionary = node_id, dictionary
         self.state = NmtState.INITIALISING
         self.cob_ids: frozenset[int] = frozenset()
+        self.data_ids = self.cob_ids
         self._send_message, self._device = send, device or Nothing()
         self._now = Ns(0)
         self._sync_wrong = False
@@ -168,6 +167,8 @@ class Node:
         self._handlers = handlers | {0x000: self._on_nmt, 0x700 + self.node_id: self._on_guarding}
         if self._handlers.keys() != self.cob_ids:
             self.cob_ids = frozenset(self._handlers)
+        remote_only = {*self._pdos.transmitters, 0x700 + self.node_id}
+        self.data_ids = self.cob_ids - remote_only if self.state is NmtState.OPERATIONAL else self.cob_ids
 
     def _on_nmt(self, msg: can.Message, now: Ns) -> None:
         if msg.is_remote_frame or len(msg.data) != 2 or msg.data[1] not in (0, self.node_id):

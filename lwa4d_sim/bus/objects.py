@@ -169,15 +169,15 @@ EXTENSION = """
 1029   =   error behaviour
 1029:1 u8  rw  0        0..2        -  -       communication error
 2F00   dom rw  -        0..65536    v  -       scratch memory (to try SDO transfers on)
-# extension, CiA 402-2; option codes' defaults are the standard's; windows and speeds assumed
-6007   i16 rw  1        0..3        -  -       abort connection option code
+# extension, CiA 402-2; option codes' defaults are the standard's but for 6007 (quick stop); windows and speeds assumed
+6007   i16 rw  3        0..3        -  -       abort connection option code
 603F   u16 ro  0        -           m  -       error code
 605A   i16 rw  2        0..8        -  -       quick stop option code
 605B   i16 rw  0        0..1        -  -       shutdown option code
 605C   i16 rw  1        0..1        -  -       disable operation option code
 605D   i16 rw  1        1..4        -  -       halt option code
 605E   i16 rw  2        0..4        -  -       fault reaction option code
-6066   u16 rw  100      -           -  ms      following error time out
+6066   u16 rw  20       -           -  ms      following error time out
 6067   u32 rw  100      -           -  mdeg    position window
 6068   u16 rw  10       -           -  ms      position window time
 606A   i16 rw  0        -           -  -       sensor selection code
@@ -194,7 +194,7 @@ EXTENSION = """
 6079   u32 ro  24000    -           m  mV      DC link circuit voltage
 607E   u8  rw  0        -           -  -       polarity
 607F   u32 rw  @speed   -           m  mdeg/s  max profile velocity
-6080   u32 rw  @rpm     -           m  rpm     max motor speed
+6080   u32 rw  0        -           m  rpm     max motor speed (0 = no limit)
 6082   u32 rw  0        -           m  mdeg/s  end velocity
 6084   u32 rw  @acceleration -      m  mdeg/s2 profile deceleration
 6085   u32 rw  @acceleration -      m  mdeg/s2 quick stop deceleration

@@ -77,6 +77,7 @@ class WirePort(can.BusABC):
         counters: its error counters.
         sends_by_priority: whether the controller offers its most urgent frame (mailboxes) or the oldest (a queue).
         recovers: whether it returns from bus-off by itself.
+        hears: whether it wants the frames of others; without, it acknowledges them and is told of error states only.
         listener: called with each received message and its reception instant, or None: messages queue for `recv`.
         inbox: received messages that wait for `recv`.
         lanes: frames queued behind those in the arbitration; the wire's.
@@ -91,6 +92,7 @@ class WirePort(can.BusABC):
         *,
         transmit: Literal["priority", "fifo"] = "priority",
         recovers: bool = False,
+        hears: bool = True,
         can_filters: can.typechecking.CanFilters | None = None,
     ) -> None:
         if transmit not in ("priority", "fifo"):
@@ -100,10 +102,11 @@ class WirePort(can.BusABC):
         self.counters = Counters()
         self.sends_by_priority = transmit == "priority"
         self.recovers = recovers
+        self.hears = hears
         self.listener = listener
         self.inbox: deque[can.Message] = deque()
         self.lanes: dict[int, deque[Pending] | None] = {}
-        self.ready = Ns(0)
+        self.ready = wire.now
         super().__init__(channel=name, can_filters=can_filters)
 
     @property

@@ -110,6 +110,7 @@ class InterpolatedPosition(_Cyclic):
     """
 
     number = 7
+    set_points = frozenset({0x60C1, 0x60B2})
     beyond = True
 
     @property
@@ -151,11 +152,11 @@ class CyclicPosition(_Cyclic):
     """Mode 8: cyclic synchronous position; a set-point that fails to come is held."""
 
     number = 8
+    set_points = frozenset({0x607A, 0x60B0})
 
     def write(self, index: int, now: Ns) -> None:
-        if index in (0x607A, 0x60B0):
-            get, count = self.axis.get, self.axis.position_count
-            self.push((get(0x607A) + get(0x60B0)) * count, now)
+        get, count = self.axis.get, self.axis.position_count
+        self.push((get(0x607A) + get(0x60B0)) * count, now)
 
     def demand(self, now: Ns) -> Point:
         q, dq, ddq = self.motion.at(now)

@@ -47,9 +47,12 @@ class Stream:
     name: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse times that are none."""
+        """Refuse what no frame can have."""
+        if not 0 <= self.can_id < (1 << 29 if self.extended else 1 << 11):
+            raise ValueError(f"no such identifier: {self.can_id:#x}")
         if self.period <= 0 or self.jitter < 0:
             raise ValueError(f"period must be positive and jitter not negative: {self}")
+        worst_bits(self.dlc)  # refuses what is no length
 
     @property
     def longest(self) -> int:

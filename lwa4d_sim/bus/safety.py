@@ -9,7 +9,7 @@ import numpy as np
 
 from lwa4d_sim.bus.dictionary import Joint
 from lwa4d_sim.errors import BusError
-from lwa4d_sim.interfaces import Array
+from lwa4d_sim.interfaces import Array, Trajectory
 
 # Distance kept from each end of a joint's range [rad]: schunk_description, lwa4d.urdf.xacro (safety offset).
 MARGIN = 0.02
@@ -62,3 +62,28 @@ class Envelope:
         if bad.any():
             k = int(np.argmax(bad))
             raise BusError("safety stop: " + text.format(self._names[k], values[k]))
+
+
+class Following:
+    """Limit of the distance between where each joint is and where it should be.
+
+    Args:
+        trajectory: the desired motion.
+        period: of the cycles [s].
+        limit: [rad].
+        names: of the joints.
+    """
+
+    def __init__(self, trajectory: Trajectory, period: float, limit: float, names: Sequence[str]) -> None:
+        self._trajectory, self._period, self._limit, self._names = trajectory, period, limit, names
+
+    def check(self, k: int, q: Array) -> None:
+        """Look at the position (n,) [rad] measured in cycle ``k``.
+
+        Raises:
+            BusError: a joint is too far off.
+        """
+        error = np.abs(self._trajectory.joint(np.array([k * self._period])).q[0] - q)
+        if error.max() > self._limit:
+            j = int(np.argmax(error))
+            raise BusError(f"safety stop: {self._names[j]} is {error[j]:.3f} rad from where it should be")

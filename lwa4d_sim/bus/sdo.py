@@ -275,7 +275,6 @@ class SdoServer:
         padding = data[0] >> 2 & 7
         if padding:
             del self._data[-padding:]
-        self._take(b"")
         if self._with_crc and crc_hqx(self._data, 0) != int.from_bytes(data[1:3], "little"):
             raise Abort(BAD_CRC)
         self._finish()

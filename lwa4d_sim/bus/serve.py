@@ -7,7 +7,8 @@ from lwa4d_sim.bus.arm import BusArm
 from lwa4d_sim.bus.connect import Connection
 from lwa4d_sim.interfaces import NS_PER_S, Ns
 
-# The plant is brought up to the clock at least this often, so that no single call takes long (assumed).
+# The plant is brought up to the clock at every SYNC, and otherwise this often: few calls of many steps, none of which
+# takes long (assumed).
 LONGEST_NAP = Ns(5_000_000)
 
 
@@ -25,12 +26,20 @@ def serve(arm: BusArm, bus: Connection, clock: Callable[[], Ns], until: Callable
         clock: the instant now [ns].
         until: asked every few milliseconds whether to end.
     """
-    deadline = arm.power_on(clock())
+    due = arm.power_on(clock())
+    now = clock()
+    step_at = now + LONGEST_NAP
     while not until():
+        left = (step_at if due is None or due > step_at else due) - now
+        msg = bus.recv(left / NS_PER_S) if left > 0 else None
         now = clock()
-        nap = LONGEST_NAP if deadline is None else max(0, min(LONGEST_NAP, deadline - now))
-        msg = bus.recv(nap / NS_PER_S)
-        now = clock()
-        deadline = arm.poll(now) if msg is None else arm.receive(msg, now)
-        arm.catch_up(now)
+        if msg is not None:
+            sooner = arm.receive(msg, now)
+            if sooner is not None and (due is None or sooner < due):
+                due = sooner
+        if now >= step_at:
+            arm.catch_up(now)
+            step_at = now + LONGEST_NAP
+        if due is not None and due <= now:
+            due = arm.poll(now)
         arm.forget()

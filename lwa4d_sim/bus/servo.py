@@ -35,7 +35,7 @@ class Servo:
         self._integral = tau
         self.saturated = False
 
-    def torque(self, ref: Point, offset: float, dt: float, *, position: bool) -> float:
+    def torque(self, ref: Point, offset: float, dt: float, *, position: bool, stopping: bool = False) -> float:
         """Torque for the next ``dt`` [s].
 
         Args:
@@ -43,11 +43,16 @@ class Servo:
             offset: torque added [N m].
             dt: [s].
             position: whether the position loop is closed.
+            stopping: loops that are switched off (2020 or 2030 = 0) take their gains after power-on, for otherwise
+                nothing would stop the axis (assumed).
         """
         axis = self._axis
+        speed_gain, position_gain = axis.speed_gain, axis.position_gain
+        if stopping:
+            speed_gain, position_gain = speed_gain or GAINS[0x2020], position_gain or GAINS[0x2030]
         speed = axis.speed_share * ref.dq
         if position:
-            speed += axis.position_gain * (ref.q - axis.q)
+            speed += position_gain * (ref.q - axis.q)
         fastest = axis.speed_max
         self.saturated = False
         if not -fastest <= speed <= fastest:
@@ -55,13 +60,13 @@ class Servo:
             self.saturated = abs(speed) > 1.05 * fastest
             speed = fastest if speed > 0 else -fastest
         error = speed - axis.dq
-        gain = axis.inertia * axis.speed_gain
+        gain = axis.inertia * speed_gain
         tau = gain * error + axis.inertia * axis.acceleration_share * ref.ddq + offset + self._integral
         limit = axis.torque_max
-        if -limit <= tau <= limit:
-            if axis.speed_time > 0:
-                self._integral += gain * error * dt / axis.speed_time
-            return tau
-        # the integral stands while the torque is limited, or it would have to be unwound later
-        self.saturated = True
-        return limit if tau > 0 else -limit
+        if abs(tau) > limit:
+            # the integral stands while the torque is limited, or it would have to be unwound later
+            self.saturated = True
+            return limit if tau > 0 else -limit
+        if axis.speed_time > 0:
+            self._integral += gain * error * dt / axis.speed_time
+        return tau

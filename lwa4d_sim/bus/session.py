@@ -9,6 +9,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from lwa4d_sim.bus.master import Master
+from lwa4d_sim.bus.safety import Following
 from lwa4d_sim.errors import BusError
 from lwa4d_sim.interfaces import Array, Arrived, IntArray, JointState, Ns
 
@@ -50,20 +51,38 @@ class Session:
         control: the controller side, as in a simulation.
         with_speed: the measurement carries the drives' own speed.
         guard: safety envelope, or None.
+        following: limit of the distance from the desired motion, or None.
+
+    Attributes:
+        fault: why the arm is being stopped, or None; there is no way back.
+        frozen: the process stands still (a fault to be injected).
+        late: cycles that were not begun in time, or not at all.
+        lateness: of the beginning of each that was [ns].
+        work: from there to the last set-point sent [ns].
     """
 
-    def __init__(self, master: Master, control: Control, *, with_speed: bool, guard: Guard | None = None) -> None:
+    def __init__(
+        self,
+        master: Master,
+        control: Control,
+        *,
+        with_speed: bool,
+        guard: Guard | None = None,
+        following: Following | None = None,
+    ) -> None:
         self._master, self._control, self._guard = master, control, guard
-        self._with_speed = with_speed
+        self._with_speed, self._following = with_speed, following
         self.fault: str | None = None
+        self.frozen = False
         self.late = 0
         self.lateness: list[Ns] = []
+        self.work: list[Ns] = []
         self._stopping = 0
 
     def cycles(self, start: Ns, ticks: int) -> Iterator[Cycle]:
         """Cycle by cycle from the instant ``start`` [ns]; each ends when the next is due.
 
-        A cycle that begins late is counted, and the next is again on the grid: no burst catches up.
+        A cycle whose time has passed is counted and left out, and the next is again on the grid: no burst catches up.
         """
         master, period = self._master, self._master.plan.period
         first = self._measured()
@@ -71,29 +90,41 @@ class Session:
         while k < ticks:
             due = Ns(start + k * period)
             master.wait(due)
-            self.lateness.append(Ns(master.clock() - due))
+            begun = master.clock()
+            gone = (begun - due) // period
+            if gone:
+                self.late += min(gone, ticks - k)
+                k += gone
+                continue
+            self.lateness.append(Ns(begun - due))
             cycle = self._cycle(k, start, first)
+            self.work.append(Ns(master.clock() - begun))
             behind = (master.clock() - start) // period
-            self.late += max(0, behind - k)
+            self.late += min(max(0, behind - k), ticks - 1 - k)
             k = max(k, behind) + 1
             master.wait(Ns(start + k * period))
             yield cycle
 
     def _cycle(self, k: int, start: Ns, first: tuple[Array, ...]) -> Cycle:
-        master = self._master
+        master, nothing = self._master, Cycle(k, None, None, None)
+        if self.frozen:
+            self.late += 1
+            return nothing
         if self.fault is not None:
             self._hold_still()
-            return Cycle(k, None, None, None)
+            return nothing
         try:
             master.sync()
             master.gather()
+            if self.frozen:
+                return nothing
             self.fault = master.watch.verdict(master.clock())
             if self.fault is None:
                 return self._compute(k, start, first)
         except BusError as error:
-            self.fault = str(error)
+            self.fault = master.watch.note(master.clock(), str(error))
         self._hold_still()
-        return Cycle(k, None, None, None)
+        return nothing
 
     def _compute(self, k: int, start: Ns, first: tuple[Array, ...]) -> Cycle:
         master = self._master
@@ -105,6 +136,8 @@ class Session:
         tau = command[0]
         if not np.isfinite(tau).all():
             raise BusError("the controller's torque is not a number")
+        if self._following is not None:
+            self._following.check(k, arrived.values[0][0])
         if self._guard is not None:
             tau = self._guard.check(arrived.values[0][0], state.dq[0], tau)
         master.command(tau)
@@ -118,6 +151,7 @@ class Session:
             if self._stopping:
                 self._master.sync()
                 self._master.gather()
+                self._master.watch.standing(self._master.clock())
             self._stopping += 1
             self._master.halt()
         except BusError:

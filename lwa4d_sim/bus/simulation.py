@@ -5,13 +5,13 @@ from contextlib import suppress
 from dataclasses import replace
 
 import can
-import numpy as np
 
 from lwa4d_sim.bus.arm import BusArm, Physics, SpeedSignal
 from lwa4d_sim.bus.commission import commission
 from lwa4d_sim.bus.dictionary import Joint
 from lwa4d_sim.bus.master import Master, Plan
 from lwa4d_sim.bus.options import FIRST_NODE, Profile, Traffic
+from lwa4d_sim.bus.safety import Following
 from lwa4d_sim.bus.session import Control, Session
 from lwa4d_sim.bus.stations import opening
 from lwa4d_sim.bus.wire import Wire, WirePort
@@ -39,50 +39,96 @@ class Simulation:
     def __init__(
         self, wire: Wire, plant: Physics, joints: Sequence[Joint], profile: Profile, source: SpeedSignal | None
     ) -> None:
-        self.wire = wire
+        self.wire, self._plant = wire, plant
         wire.port("arm", self._received)  # hears for all drives; each speaks, and fails, by a controller of its own
         self.ports: dict[int, WirePort] = {}
+        self.cut: set[int] = set()  # nodes that are off the bus, as a fault
+        self.notes: list[tuple[Ns, str]] = []
         self.arm = BusArm(plant, joints, FIRST_NODE, profile, source, self._sender)
         self._timer = Ns(2**62)
         self._remind(self.arm.power_on(wire.now))
 
-    def run(self, plan: Plan, control: Control, timing: Timing, *, with_speed: bool) -> Iterator["Tick"]:
-        """Set up, then one `Tick` a period.
+    def run(
+        self, plan: Plan, control: Control, timing: Timing, *, with_speed: bool, following: Following | None = None
+    ) -> Iterator[Tick]:
+        """Set up, and hand out the running loop, one tick a period.
 
         Raises:
             BusError: the drives cannot be set up.
         """
-        master = Master(self.wire.port("master"), lambda: self.wire.now, plan)
-        commission(master, opening(plan.profile))
+        self.master_port = self.wire.port("master")
+        self.master = Master(self.master_port, lambda: self.wire.now, plan)
+        self.session = Session(self.master, control, with_speed=with_speed, following=following)
+        commission(self.master, opening(plan.profile))
         self.wire.run_until(Ns(0))
-        self.session = Session(master, control, with_speed=with_speed)
-        self.master = master
+        return self._ticks(timing)
+
+    def _ticks(self, timing: Timing) -> Iterator[Tick]:
         for cycle in self.session.cycles(Ns(0), timing.ticks):
             self.arm.catch_up(Ns((cycle.k + 1) * timing.period))
             q, dq, tau = self.arm.collect()
-            lost = None if np.isfinite(dq).all() else np.array([True])
-            yield Tick(cycle.k, cycle.state, cycle.command, cycle.age, q, dq, tau, lost)
+            yield Tick(cycle.k, cycle.state, cycle.command, cycle.age, q, dq, tau, self._plant.diverged())
 
     def annotated(self, log: RunLog) -> RunLog:
         """The record of the run with the frames and what the master noted."""
         said = [(t / NS_PER_S, text) for t, text in self.master.watch.events if t >= 0]
+        said += [(t / NS_PER_S, text) for t, text in self.notes]
         events = tuple(sorted([*log.events, *said]))
         return replace(log, frames=FrameLog.of(self.wire.frames), events=events)
 
+    # What may be done to it (`faults`).
+
+    def cut_off(self, node: int, *, power: bool) -> None:
+        """Take a drive off the bus; without power its brake closes too."""
+        self.cut.add(node)
+        self.ports[node].flush_tx_buffer()
+        self.arm.silence(node, deaf=True)
+        if not power:
+            self.arm.switch_off(node, self.wire.now)
+
+    def connect(self, node: int, *, power: bool) -> None:
+        """Bring a drive back to the bus; one that was without power starts anew."""
+        self.cut.discard(node)
+        self.arm.silence(node, deaf=self.ports[node].counters.off)
+        if not power:
+            self.switch_on(node)
+
+    def switch_on(self, node: int) -> None:
+        """A drive starts anew."""
+        self._remind(self.arm.switch_on(node, self.wire.now))
+
+    def fail(self, k: int, code: int) -> None:
+        """The drive of joint ``k`` finds an error of its own."""
+        self.arm.drives[k].advance(self.wire.now)
+        self.arm.drives[k].fail(code)
+
+    def freeze(self) -> None:
+        """The master's process stands still; its CAN controller still receives."""
+        self.session.frozen = True
+        late = self._late = list[can.Message]()
+        self.master_port.listener = lambda msg, now: late.append(msg)
+
+    def thaw(self) -> None:
+        """It goes on and finds what has come meanwhile."""
+        self.session.frozen = False
+        self.master_port.listener = None
+        self.master_port.inbox.extend(self._late)
+
     def _sender(self, node: int) -> Callable[[can.Message], None]:
-        port = self.wire.port(f"node {node}", lambda msg, now: self._told(node, msg, now), recovers=True)
+        port = self.wire.port(f"node {node}", lambda msg, now: self._told(node, msg, now), recovers=True, hears=False)
         self.ports[node] = port
 
         def send(msg: can.Message) -> None:
-            with suppress(can.CanOperationError):  # bus-off: the frame is lost
-                port.send(msg)
+            if node not in self.cut:
+                with suppress(can.CanOperationError):  # bus-off: the frame is lost
+                    port.send(msg)
 
         return send
 
     def _told(self, node: int, msg: can.Message, now: Ns) -> None:
         """What a node's own controller reports: an error state, in which it may be deaf as well."""
         if msg.is_error_frame:
-            self.arm.silence(node, deaf=self.ports[node].counters.off)
+            self.arm.silence(node, deaf=self.ports[node].counters.off or node in self.cut)
             self.arm.nodes[node - FIRST_NODE].receive(msg, now)
 
     def _received(self, msg: can.Message, now: Ns) -> None:

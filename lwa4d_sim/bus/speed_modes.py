@@ -36,6 +36,7 @@ class ProfileSpeed(Mode):
     """Mode 3: ramps to a speed and keeps it, until a software limit."""
 
     number = 3
+    set_points = frozenset({0x60FF})
 
     def __init__(self, axis: Axis) -> None:
         super().__init__(axis)
@@ -47,8 +48,7 @@ class ProfileSpeed(Mode):
         self._follow(now)
 
     def write(self, index: int, now: Ns) -> None:
-        if index == 0x60FF:
-            self._follow(now)
+        self._follow(now)
 
     def _follow(self, now: Ns) -> None:
         axis = self.axis
@@ -89,16 +89,13 @@ class Velocity(ProfileSpeed):
     """
 
     number = 2
+    set_points = frozenset({0x6042})
 
     def control(self, word: int, now: Ns) -> None:
         if (word ^ self.word) & 0x70:
             self.word = word
             self._follow(now)
         self.word = word
-
-    def write(self, index: int, now: Ns) -> None:
-        if index == 0x6042:
-            self._follow(now)
 
     def _follow(self, now: Ns) -> None:
         get = self.axis.get

@@ -92,11 +92,14 @@ class Station:
         stamp: SYNC [ns] of the last TPDO 1.
         since: when that TPDO arrived [ns].
         fresh: TPDOs of this cycle that have arrived, as bits.
+        owed: TPDOs that did not come in the cycle before, as bits; what comes now may be these.
+        complete: all TPDOs of this cycle have arrived.
         missed: cycles in a row without TPDO 1.
         alive: last sign of life on the error control channel [ns].
         nmt: state it last told there, or None.
         emergency: last error code reported and not taken back, 0 = none.
         boots: boot-up messages seen.
+        answers: SDO answers seen.
     """
 
     node: int
@@ -105,11 +108,14 @@ class Station:
     stamp: Ns = NEVER
     since: Ns = NEVER
     fresh: int = 0
+    owed: int = 0
+    complete: bool = False
     missed: int = 0
     alive: Ns = NEVER
     nmt: int | None = None
     emergency: int = 0
     boots: int = 0
+    answers: int = 0
 
     @property
     def status(self) -> int:

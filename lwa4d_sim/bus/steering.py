@@ -98,7 +98,7 @@ class Steering:
         arrow = self.machine.command(word, resettable=resettable)
         if arrow is not None and arrow.target is State.OPERATION_ENABLED:
             self._before, self._fresh = before, True
-        elif self.why is Why.RUN and not self._brake.closed and self.machine.state is State.OPERATION_ENABLED:
+        elif self.machine.state is State.OPERATION_ENABLED and not self._fresh:
             self.mode.control(self.bits, now)
         return arrow is not None and arrow.number == 15
 

@@ -10,6 +10,7 @@ class ProfileTorque(Mode):
     """Mode 4: torque with a slope (6087)."""
 
     number = 4
+    set_points = frozenset({0x6071})
     loop = Loop.TORQUE
 
     def __init__(self, axis: Axis) -> None:
@@ -22,8 +23,7 @@ class ProfileTorque(Mode):
         self._follow(now)
 
     def write(self, index: int, now: Ns) -> None:
-        if index == 0x6071:
-            self._follow(now)
+        self._follow(now)
 
     def _follow(self, now: Ns) -> None:
         self._from, self._begin = self.torque(now), now
@@ -48,6 +48,7 @@ class CyclicTorque(Mode):
     """Mode 10: cyclic synchronous torque."""
 
     number = 10
+    set_points = frozenset({0x6071, 0x60B2})
     loop = Loop.TORQUE
 
     def torque(self, now: Ns) -> float:

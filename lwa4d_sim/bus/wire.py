@@ -65,12 +65,15 @@ class Wire(Medium):
         *,
         transmit: Literal["priority", "fifo"] = "priority",
         recovers: bool = False,
+        hears: bool = True,
         can_filters: can.typechecking.CanFilters | None = None,
     ) -> WirePort:
         """A new node on the wire; the arguments are those of `WirePort`."""
         if any(port.name == name for port in self._ports):
             raise ValueError(f"there is a port {name!r} on this wire already")
-        port = WirePort(self, name, listener, transmit=transmit, recovers=recovers, can_filters=can_filters)
+        port = WirePort(
+            self, name, listener, transmit=transmit, recovers=recovers, hears=hears, can_filters=can_filters
+        )
         self._ports += (port,)
         self._watch()
         return port

@@ -1,0 +1,146 @@
+"""The loop over the simulated CANopen bus against the sampled loop: two roads to the same run."""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lwa4d_sim.arm import ARMS, MODULES
+from lwa4d_sim.bus.joints import TORQUE_CONSTANT
+from lwa4d_sim.errors import BusError
+from lwa4d_sim.record import RunLog
+from lwa4d_sim.runner import run
+from lwa4d_sim.scenario import Scenario
+
+MILLIDEGREE = math.pi / 180_000
+START = {
+    "lwa4d_3dof": [-1.5707963267948966, -1.5707963267948966, 1.5707963267948966],
+    "lwa4d_7dof": [-1.57, 0.01, 0.0, 1.62, 0.0, -0.32, 0.0],
+}
+PD = {"kind": "pd_gravity", "kp": 20.0, "kd": 4.0}
+COMPUTED_TORQUE = {"kind": "computed_torque", "p": 12}
+HELD = {"kind": "filtered_derivative", "time_constant": 0.01, "runs_on": "held"}
+
+
+def torque_steps(arm: str, profile: str) -> list[float]:
+    """One count of each joint's torque object [N m]: per mille of the peak torque, or a milliampere."""
+    joints = [link.joint for link in ARMS[arm].links]
+    if profile == "lwa4d":
+        return [TORQUE_CONSTANT / 1000] * len(joints)
+    return [MODULES[joint - 1].torque_max / 1000 for joint in joints]
+
+
+def both(arm: str, profile: str, controller: Any, actuation: str, **canopen: Any) -> tuple[RunLog, RunLog]:
+    """The sampled run with the bus's resolutions, and the run over the bus."""
+    n = len(START[arm])
+    goal = (np.array(START[arm]) + np.linspace(0.3, -0.2, n)).tolist()
+    velocity = canopen.pop("velocity", HELD)
+    period = canopen.pop("period", 0.01)
+    common = {"period": period, "actuation": actuation, "velocity": velocity}
+    sampled = {"position_resolution": MILLIDEGREE, "torque_resolution": torque_steps(arm, profile)}
+    document = {
+        "name": "two_roads",
+        "arm": arm,
+        "initial": {"q": START[arm]},
+        "trajectory": {
+            "waypoints": {"space": "joint", "points": [goal]},
+            "segment_time": 0.6,
+            "profile": "quintic",
+            "follow": "joint",
+        },
+        "controller": controller,
+        "variants": {
+            "sampled": {"loop": {"kind": "sampled", **common, **sampled}},
+            "canopen": {"loop": {"kind": "canopen", **common, "profile": profile, **canopen}},
+        },
+    }
+    scenario = Scenario.parse(json.dumps(document))
+    return run(scenario, "sampled"), run(scenario, "canopen")
+
+
+def same(sampled: RunLog, canopen: RunLog) -> None:
+    """Sample for sample: the two differ by the rounding of counts to radians alone."""
+    np.testing.assert_allclose(canopen.q, sampled.q, atol=1e-9)
+    np.testing.assert_allclose(canopen.dq, sampled.dq, atol=1e-7)
+    np.testing.assert_allclose(canopen.tau, sampled.tau, atol=1e-9)
+    np.testing.assert_allclose(canopen.ticks.q, sampled.ticks.q, atol=1e-12)
+    assert np.abs(canopen.q[-1] - canopen.q[0]).max() > 0.2, "it moved"
+
+
+@pytest.mark.parametrize("profile", ["cia402", "lwa4d"])
+@pytest.mark.parametrize(("arm", "controller"), [("lwa4d_3dof", PD), ("lwa4d_7dof", COMPUTED_TORQUE)])
+def test_a_bus_that_costs_nothing_is_the_ideal_link(arm: str, controller: Any, profile: str) -> None:
+    same(*both(arm, profile, controller, "immediate", bit_rate=None))
+
+
+@pytest.mark.parametrize("profile", ["cia402", "lwa4d"])
+@pytest.mark.parametrize(("arm", "controller"), [("lwa4d_3dof", PD), ("lwa4d_7dof", COMPUTED_TORQUE)])
+def test_the_cycle_at_500_kbit_is_the_sampled_loop_with_next_sync(arm: str, controller: Any, profile: str) -> None:
+    sampled, canopen = both(arm, profile, controller, "next_sync")
+    same(sampled, canopen)
+    assert canopen.frames is not None
+    in_cycles = canopen.frames.queued >= 0
+    sync = in_cycles & (canopen.frames.id == 0x080)
+    pdo = in_cycles & (canopen.frames.id >= 0x180) & (canopen.frames.id < 0x380)
+    assert sync.sum() == 60
+    assert pdo.sum() == 60 * 4 * len(START[arm])
+
+
+@pytest.mark.parametrize("period", [0.005, 0.02])
+def test_other_periods(period: float) -> None:
+    same(*both("lwa4d_3dof", "cia402", PD, "next_sync", period=period))
+
+
+def test_the_drives_own_speed_is_the_filters_to_a_millidegree() -> None:
+    """The speed signal of the drives crosses the bus in counts, so the runs part by counts and no more."""
+    velocity = {"kind": "filtered_derivative", "time_constant": 0.01, "runs_on": "continuous"}
+    sampled, canopen = both("lwa4d_3dof", "cia402", PD, "next_sync", velocity=velocity)
+    count = np.array(torque_steps("lwa4d_3dof", "cia402"))
+    assert (np.abs(canopen.tau - sampled.tau) <= 2.5 * count).all()
+    np.testing.assert_allclose(canopen.ticks.dq[:20], sampled.ticks.dq[:20], atol=2 * MILLIDEGREE)
+
+
+def test_a_command_on_its_way_acts_at_the_nearest_plant_step() -> None:
+    """With event-driven set-points each joint's torque changes when its frame has arrived."""
+    _, canopen = both("lwa4d_3dof", "lwa4d", PD, "immediate")
+    frames = canopen.frames
+    assert frames is not None
+    for joint, node in enumerate((3, 4, 5)):
+        here = (frames.id == 0x200 + node) & (frames.queued > 0)
+        arrivals = {round(int(t) / 1e6) for t in frames.received[here]}
+        changes = set((np.flatnonzero(np.diff(canopen.tau[:, joint])) + 1).tolist())
+        assert changes <= arrivals
+        assert len(changes) > 40
+        assert min(t % 10 for t in arrivals) >= 1, "not at the SYNC"
+
+
+def test_two_runs_are_alike_to_the_last_frame_and_noise_costs_time() -> None:
+    runs = [both("lwa4d_3dof", "cia402", PD, "next_sync", noise={"per_bit": 2e-4})[1] for _ in range(2)]
+    first, second = (log.frames for log in runs)
+    assert first is not None
+    assert second is not None
+    np.testing.assert_array_equal(runs[0].q, runs[1].q)
+    np.testing.assert_array_equal(first.started, second.started)
+    np.testing.assert_array_equal(first.data, second.data)
+    expected = 2e-4 * first.bits.sum()
+    assert abs((first.outcome == 1).sum() - expected) < 4 * math.sqrt(expected), "spoilt frames"
+    assert (first.attempt > 1).any()
+
+
+def test_other_traffic_delays_the_sync() -> None:
+    """A long frame on the wire makes the SYNC wait, at most that frame's length."""
+    _, canopen = both("lwa4d_3dof", "cia402", PD, "next_sync", traffic=[{"id": 0x7F0, "size": 8, "period": 0.0009}])
+    frames = canopen.frames
+    assert frames is not None
+    sync = (frames.id == 0x080) & (frames.queued >= 0)
+    wait = frames.started[sync] - frames.queued[sync]
+    assert wait.max() > 0
+    assert wait.max() <= 135 * 2000
+
+
+def test_a_bus_too_slow_for_its_cycle_is_refused() -> None:
+    """At 100 kbit/s the cycle of seven joints needs more than 30 ms."""
+    with pytest.raises(BusError, match=r"kbit/s"):
+        both("lwa4d_7dof", "cia402", COMPUTED_TORQUE, "next_sync", bit_rate=100_000)
