@@ -4,13 +4,14 @@ import json
 import math
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from lwa4d_sim.console import Json, Out, Set, override, progress, scenario_path
-from lwa4d_sim.errors import ScenarioError
+from lwa4d_sim.console import Json, Out, Set, busy, override, progress, scenario_path
+from lwa4d_sim.errors import BusError, ScenarioError
 
 bus_app = typer.Typer(
     help="The arm or the controller on a CAN bus, and what the bus does.",
@@ -38,6 +39,7 @@ def timing(
     variant: _Variant = None,
     overrides: Set = None,
     cycles: Annotated[int, typer.Option(min=3, help="Cycles to look at.")] = 200,
+    log: _Log = None,
     as_json: Json = False,
 ) -> None:
     """Show one cycle on the simulated bus, its load, and response times beside their worst case.
@@ -45,51 +47,32 @@ def timing(
     Example: lwa4d-sim bus timing canopen7 -o runs
     """
     from lwa4d_sim.bus.build import bus_loop, canopen_run
+    from lwa4d_sim.bus.frame_files import write
     from lwa4d_sim.bus_plots import draw_timing
-    from lwa4d_sim.bus_timing import analyse
+    from lwa4d_sim.bus_timing import analyse, as_object, as_text
     from lwa4d_sim.frame_log import FrameLog
 
     blocks = _blocks(file, variant, overrides)
     loop = bus_loop(blocks.settings)
     if loop.bit_rate is None:
         raise ScenarioError(f"{blocks.scenario.source}: loop.bit_rate is null: frames take no time there")
-    simulation, ticks = canopen_run(blocks)
+    with blocks.about("loop"):
+        simulation, ticks = canopen_run(blocks)
     total = min(cycles, blocks.timing.ticks)
     with progress("cycles", total, quiet=as_json) as advance:
         for _, _tick in zip(range(total), ticks, strict=False):
             advance()
     found = analyse(FrameLog.of(simulation.wire.frames), loop.bit_rate, blocks.timing.period, total)
+    if log is not None:
+        write(found.log, log)
     folder = out / f"{blocks.scenario.name}"
     folder.mkdir(parents=True, exist_ok=True)
     title = f"{blocks.scenario.name}, {blocks.variant}: one cycle at {loop.bit_rate // 1000} kbit/s"
     picture = draw_timing(found, title, loop.period, folder / "bus_timing.png")
-    log = found.log
     if as_json:
-        rows = [
-            {
-                "id": int(log.id[k]),
-                "bits": int(log.bits[k]),
-                "start": (int(log.started[k]) - found.start) / 1e9,
-                "end": (int(log.received[k]) - found.start) / 1e9,
-            }
-            for k in found.cycle
-        ]
-        response = {
-            str(r.id): {"max": float(r.seen.max()), "bound": r.bound if math.isfinite(r.bound) else None}
-            for r in found.responses
-        }
-        picture_path = str(picture.path)
-        print(json.dumps({"frames": rows, "load": found.load, "response": response, "picture": picture_path}))
+        print(json.dumps({**as_object(found), "picture": str(picture.path)}))
         return
-    print(f"{'frame':16} {'bits':>5} {'start [ms]':>11} {'end [ms]':>9}")
-    for k in found.cycle:
-        start, end = ((int(t) - found.start) / 1e6 for t in (log.started[k], log.received[k]))
-        print(f"{_name(int(log.id[k])):16} {int(log.bits[k]):5} {start:11.3f} {end:9.3f}")
-    print(f"\n{'identifier':16} {'frames':>7} {'longest [ms]':>13} {'worst case [ms]':>16}")
-    for r in found.responses:
-        bound = f"{r.bound * 1e3:.3f}" if math.isfinite(r.bound) else "none"
-        print(f"{r.name:16} {len(r.seen):7} {r.seen.max() * 1e3:13.3f} {bound:>16}")
-    print(f"\nbus load {100 * found.load:.1f} %\npicture: {picture.path}")
+    print(f"{as_text(found)}\npicture: {picture.path}")
 
 
 @bus_app.command()
@@ -112,9 +95,10 @@ def serve(
     """
     from lwa4d_sim.bus.build import bus_loop, served_arm
     from lwa4d_sim.bus.connect import connect, log_to
-    from lwa4d_sim.bus.process import stoppable, undisturbed
+    from lwa4d_sim.bus.process import ARM, stoppable, undisturbed
     from lwa4d_sim.bus.serve import monotonic
     from lwa4d_sim.bus.serve import serve as keep_serving
+    from lwa4d_sim.bus.survey import Surveyor
 
     blocks = _blocks(file, variant, overrides)
     bus = connect(interface, channel, bus_loop(blocks.settings).bit_rate)
@@ -123,8 +107,11 @@ def serve(
         with stoppable() as stop:
             arm = served_arm(blocks, bus, epoch=monotonic(), per_sync=per_sync)
             nodes = ", ".join(str(node.node_id) for node in arm.nodes)
+            taken = Surveyor(bus, monotonic).answering(node.node_id for node in arm.nodes)
+            if taken:
+                raise BusError(f"{bus.channel_info} is in use: node {taken[0]} answers there already")
             end = math.inf if seconds is None else time.monotonic() + seconds
-            with undisturbed(realtime=realtime):
+            with undisturbed(ARM if realtime else None):
                 print(f"{blocks.settings.arm}: nodes {nodes} on {interface} {channel}; Ctrl-C ends", flush=True)
                 keep_serving(arm, bus, monotonic, lambda: stop() or time.monotonic() > end)
         print(f"ended; brakes closed: {sum(drive.braked for drive in arm.drives)} of {len(arm.drives)}")
@@ -173,12 +160,107 @@ def drive(
     raise typer.Exit(0 if found["ended"] == "done" else 2)
 
 
+@bus_app.command()
+def replay(
+    file: Annotated[Path, typer.Argument(metavar="LOG", help="Log in any format that python-can reads.")],
+    interface: _Interface,
+    channel: _Channel,
+    arm: Annotated[
+        bool, typer.Option("--arm", help="Also send what drives obey: NMT, SYNC, set-points, SDO requests.")
+    ] = False,
+) -> None:
+    """Send the frames of a log again, as far apart as they were.
+
+    Example: lwa4d-sim bus replay run.log -i udp_multicast -c 239.74.163.2
+    """
+    from lwa4d_sim.bus.connect import connect
+    from lwa4d_sim.bus.frame_files import replay as send_again
+    from lwa4d_sim.bus.process import stoppable
+
+    bus = connect(interface, channel)
+    try:
+        with stoppable() as stop:
+            sent, left_out = send_again(file, bus, stop, commands=arm)
+    finally:
+        bus.shutdown()
+    print(f"{sent} frames sent, {left_out} left out" + (" (commands; --arm sends them too)" if left_out else ""))
+
+
+@bus_app.command()
+def check(
+    interface: _Interface,
+    channel: _Channel,
+    file: Annotated[
+        str | None, typer.Argument(metavar="[FILE]", help="Scenario that the bus is compared with.")
+    ] = None,
+    variant: _Variant = None,
+    overrides: Set = None,
+    bit_rate: Annotated[
+        int | None, typer.Option(metavar="BIT/S", min=1, help="Of the bus; default the scenario's, else 500000.")
+    ] = None,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.0, help="Listen so long before asking.")] = 1.0,
+    sheet: Annotated[
+        Path | None, typer.Option("--eds", metavar="SHEET", help="Name the objects of this sheet that a node lacks.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Say who is on a bus and what differs from a scenario. Reads only: nothing is written, nothing enabled.
+
+    Example: lwa4d-sim bus check -i socketcan -c can0 canopen7
+    """
+    from lwa4d_sim.bus.build import bus_loop, plan_for
+    from lwa4d_sim.bus.connect import connect
+    from lwa4d_sim.bus.differences import beside_sheet, differences
+    from lwa4d_sim.bus.serve import monotonic
+    from lwa4d_sim.bus.sheet import load
+    from lwa4d_sim.bus.survey import Surveyor
+    from lwa4d_sim.bus_tables import print_survey
+    from lwa4d_sim.settings import CanopenLoop
+
+    blocks = None if file is None else _blocks(file, variant, overrides)
+    loop = CanopenLoop() if blocks is None else bus_loop(blocks.settings)
+    rate = bit_rate or loop.bit_rate
+    objects = None if sheet is None else load(sheet)
+    bus = connect(interface, channel, rate)
+    try:
+        with busy("looking at the bus", quiet=as_json):
+            surveyor = Surveyor(bus, monotonic)
+            found = surveyor.survey(rate, seconds)
+            said = [] if objects is None else beside_sheet(surveyor, found, objects)
+    finally:
+        bus.shutdown()
+    said += [] if blocks is None else differences(found, plan_for(blocks, loop), rate)
+    if as_json:
+        print(json.dumps({**asdict(found), "differences": list(map(asdict, said))}))
+    else:
+        print_survey(found, said)
+    raise typer.Exit(1 if any(not each.rewritten for each in said) else 0)
+
+
+@bus_app.command()
+def eds(
+    file: _File,
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder the sheets go into.")],
+    variant: _Variant = None,
+    overrides: Set = None,
+) -> None:
+    """Write the object dictionary of each drive as an electronic data sheet.
+
+    Example: lwa4d-sim bus eds canopen7 -o sheets
+    """
+    from lwa4d_sim.bus.build import write_sheets
+
+    for path in write_sheets(_blocks(file, variant, overrides), out):
+        print(path)
+
+
 def _dry_run(blocks: Any) -> None:
     """Print what the master would send, taken from a run against the simulated arm."""
     from lwa4d_sim.bus.build import canopen_run
     from lwa4d_sim.bus_timing import name_of
 
-    simulation, ticks = canopen_run(blocks)
+    with blocks.about("loop"):
+        simulation, ticks = canopen_run(blocks)
     for _, _tick in zip(range(3), ticks, strict=False):
         pass
     print("dry run: frames to the drives, from the simulated arm; --arm opens the bus and enables them")
@@ -206,9 +288,3 @@ def _blocks(file: str, variant: str | None, overrides: list[str] | None) -> Any:
     if chosen is None or isinstance(scenario.variants[chosen].loop, IdealLoop):
         raise ScenarioError(f"{scenario.source}: an ideal loop has no bus; choose another variant")
     return build_blocks([scenario], chosen, 1)
-
-
-def _name(can_id: int) -> str:
-    from lwa4d_sim.bus_timing import name_of
-
-    return f"{can_id:03X} {name_of(can_id)}"

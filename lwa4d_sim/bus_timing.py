@@ -1,6 +1,7 @@
 """What one cycle on the bus looks like: time line, load, and response times beside their worst case."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -86,3 +87,37 @@ def analyse(log: FrameLog, bit_rate: int, period: Ns, cycles: int) -> BusTiming:
     cycle = np.flatnonzero((log.started >= k * period) & (log.started < (k + 1) * period))
     responses = [Responses(can_id, name_of(can_id), times, bounds[can_id] / NS_PER_S) for can_id, times in seen]
     return BusTiming(log, cycle, Ns(k * period), load, responses)
+
+
+def as_object(timing: BusTiming) -> dict[str, Any]:
+    """For JSON: the frames of the cycle [s from its start], the load, and by identifier the longest response [s]."""
+    log = timing.log
+    frames = [
+        {
+            "id": int(log.id[k]),
+            "bits": int(log.bits[k]),
+            "start": (int(log.started[k]) - timing.start) / NS_PER_S,
+            "end": (int(log.received[k]) - timing.start) / NS_PER_S,
+        }
+        for k in timing.cycle
+    ]
+    response = {
+        str(r.id): {"max": float(r.seen.max()), "bound": r.bound if np.isfinite(r.bound) else None}
+        for r in timing.responses
+    }
+    return {"frames": frames, "load": timing.load, "response": response}
+
+
+def as_text(timing: BusTiming) -> str:
+    """For a terminal."""
+    log = timing.log
+    lines = [f"{'frame':16} {'bits':>5} {'start [ms]':>11} {'end [ms]':>9}"]
+    for k in timing.cycle:
+        start, end = ((int(t) - timing.start) / 1e6 for t in (log.started[k], log.received[k]))
+        name = f"{int(log.id[k]):03X} {name_of(int(log.id[k]))}"
+        lines.append(f"{name:16} {int(log.bits[k]):5} {start:11.3f} {end:9.3f}")
+    lines += ["", f"{'identifier':16} {'frames':>7} {'longest [ms]':>13} {'worst case [ms]':>16}"]
+    for r in timing.responses:
+        bound = f"{r.bound * 1e3:.3f}" if np.isfinite(r.bound) else "none"
+        lines.append(f"{r.name:16} {len(r.seen):7} {r.seen.max() * 1e3:13.3f} {bound:>16}")
+    return "\n".join([*lines, "", f"bus load {100 * timing.load:.1f} %"])

@@ -11,6 +11,8 @@ from lwa4d_sim.interfaces import IntArray
 
 #: How a transmission ended, by number.
 OUTCOMES = ("sent", "error", "discarded")
+_FIELDS = ("can_id", "extended", "remote", "dlc", "data", "bits", "attempt", "outcome", "node")
+_TIMES = ("queued", "started", "received")
 _UNITS = {"id": "", "extended": "", "remote": "", "size": "B", "data": "", "bits": "bit", "attempt": "", "outcome": ""}
 _UNITS |= {"node": "", "queued": "ns", "started": "ns", "received": "ns"}
 
@@ -50,27 +52,30 @@ class FrameLog:
     def of(frames: Iterable[Any]) -> "FrameLog":
         """The columns of a list of transmissions (`lwa4d_sim.bus.wire.WireFrame`)."""
         rows = list(frames)
-        names = tuple(dict.fromkeys(frame.node for frame in rows))
+        # one pass that turns rows into columns is much quicker than one pass a column
+        column = (
+            dict(zip(rows[0]._fields, zip(*rows, strict=True), strict=True))
+            if rows
+            else dict.fromkeys(_FIELDS + _TIMES, ())
+        )
+        names = tuple(dict.fromkeys(column["node"]))
         number = {name: k for k, name in enumerate(names)}
-
-        def column(values: Iterable[Any]) -> IntArray:
-            return np.fromiter(values, np.int64, len(rows))
-
+        outcome = {name: k for k, name in enumerate(OUTCOMES)}
         never = int(np.iinfo(np.int64).min)
-        data = b"".join(bytes(frame.data).ljust(8, b"\0") for frame in rows)
+        data = b"".join([bytes(one).ljust(8, b"\0") for one in column["data"]])
         return FrameLog(
-            id=column(frame.can_id for frame in rows),
-            extended=column(frame.extended for frame in rows).astype(bool),
-            remote=column(frame.remote for frame in rows).astype(bool),
-            size=column(frame.dlc for frame in rows),
+            id=np.array(column["can_id"], np.int64),
+            extended=np.array(column["extended"], bool),
+            remote=np.array(column["remote"], bool),
+            size=np.array(column["dlc"], np.int64),
             data=np.frombuffer(data, np.uint8).reshape(-1, 8),
-            bits=column(frame.bits for frame in rows),
-            attempt=column(frame.attempt for frame in rows),
-            outcome=column(OUTCOMES.index(frame.outcome) for frame in rows),
-            node=column(number[frame.node] for frame in rows),
-            queued=column(frame.queued for frame in rows),
-            started=column(frame.started for frame in rows),
-            received=column(never if frame.received is None else frame.received for frame in rows),
+            bits=np.array(column["bits"], np.int64),
+            attempt=np.array(column["attempt"], np.int64),
+            outcome=np.array([outcome[one] for one in column["outcome"]], np.int64),
+            node=np.array([number[one] for one in column["node"]], np.int64),
+            queued=np.array(column["queued"], np.int64),
+            started=np.array(column["started"], np.int64),
+            received=np.array([never if one is None else one for one in column["received"]], np.int64),
             names=names,
         )
 

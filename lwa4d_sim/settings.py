@@ -161,6 +161,7 @@ class CanopenLoop:
         following_error: distance of a joint from its desired motion at which the arm is stopped [rad]; default none.
         noise: bit errors.
         traffic: frames of other stations.
+        nodes: node id of each joint; default the real arm's (joint 1 is 3, joint 7 is 9), for another arm 3 and up.
         faults: what goes wrong, and when.
     """
 
@@ -176,6 +177,7 @@ class CanopenLoop:
     following_error: Positive | None = None
     noise: Noise = Noise()
     traffic: tuple[Traffic, ...] = ()
+    nodes: tuple[Annotated[int, Ge(1), Le(126)], ...] | None = None
     faults: tuple[Fault, ...] = ()
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from lwa4d_sim.arm import ARMS, MODULES
 from lwa4d_sim.bus.joints import TORQUE_CONSTANT
-from lwa4d_sim.errors import BusError
+from lwa4d_sim.errors import ScenarioError
 from lwa4d_sim.record import RunLog
 from lwa4d_sim.runner import run
 from lwa4d_sim.scenario import Scenario
@@ -107,7 +108,7 @@ def test_a_command_on_its_way_acts_at_the_nearest_plant_step() -> None:
     _, canopen = both("lwa4d_3dof", "lwa4d", PD, "immediate")
     frames = canopen.frames
     assert frames is not None
-    for joint, node in enumerate((3, 4, 5)):
+    for joint, node in enumerate((3, 4, 6)):
         here = (frames.id == 0x200 + node) & (frames.queued > 0)
         arrivals = {round(int(t) / 1e6) for t in frames.received[here]}
         changes = set((np.flatnonzero(np.diff(canopen.tau[:, joint])) + 1).tolist())
@@ -142,5 +143,22 @@ def test_other_traffic_delays_the_sync() -> None:
 
 def test_a_bus_too_slow_for_its_cycle_is_refused() -> None:
     """At 100 kbit/s the cycle of seven joints needs more than 30 ms."""
-    with pytest.raises(BusError, match=r"kbit/s"):
+    with pytest.raises(ScenarioError, match=r"375 % of the bus .* at least 375000 bit/s"):
         both("lwa4d_7dof", "cia402", COMPUTED_TORQUE, "next_sync", bit_rate=100_000)
+
+
+def test_the_record_keeps_the_frames(tmp_path: Path) -> None:
+    _, log = both("lwa4d_3dof", "lwa4d", PD, "next_sync")
+    log.save(tmp_path / "canopen.h5")
+    again = RunLog.load(tmp_path / "canopen.h5").frames
+    assert log.frames is not None
+    assert again is not None
+    assert again.names == log.frames.names
+    assert {"master", "node 3", "node 6"} <= set(again.names)
+    for name, (column, unit) in log.frames.columns().items():
+        np.testing.assert_array_equal(again.columns()[name][0], column)
+        assert again.columns()[name][1] == unit
+    # what a drive says is where the arm is: TPDO 1 carries statusword, torque and position
+    here = (again.id == 0x183) & (again.queued >= 0)
+    position = again.data[here][:, 4:8].copy().view("<i4")[:, 0] * MILLIDEGREE
+    np.testing.assert_allclose(position, log.q[: 10 * len(position) : 10, 0], atol=0.51 * MILLIDEGREE)

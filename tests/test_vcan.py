@@ -1,13 +1,17 @@
 """SocketCAN for real: processes that meet on the interface vcan0 of a Linux kernel booted under QEMU."""
 
 import json
+import math
 import re
 import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from lwa4d_sim.record import RunLog
 
 VCAN = Path(__file__).parent.parent / "scripts" / "vcan"
 NOT_TO_BE_HAD = 77  # exit code of scripts/vcan where QEMU or the kernel cannot be had
@@ -123,3 +127,50 @@ def test_controller_and_arm_are_two_programs_on_vcan0(tmp_path: Path) -> None:
         for start, end in pairwise(syncs)
     ]
     assert sum(whole) > 0.95 * cycles
+
+
+ARM = """
+set -eu
+candump -L vcan0 >$TMPDIR/bus.log & LOG=$!
+{python} -m lwa4d_sim bus serve {scenario} -i socketcan -c vcan0 --realtime >$TMPDIR/serve.txt 2>&1 & ARM=$!
+until grep -q "Ctrl-C ends" $TMPDIR/serve.txt; do
+    sleep 0.1
+    kill -0 $ARM || {{ cat $TMPDIR/serve.txt; exit 9; }}
+done
+code=0
+{python} -m lwa4d_sim bus drive {scenario} -i socketcan -c vcan0 --arm --realtime --json \
+    --seconds {seconds} -o $TMPDIR >$TMPDIR/drive.json || code=$?
+kill -INT $ARM; wait $ARM
+sleep 0.1; kill $LOG
+cp $TMPDIR/bus.log $TMPDIR/serve.txt $TMPDIR/drive.json $TMPDIR/*.h5 {out}
+exit $code
+"""
+
+
+@pytest.mark.slow
+def test_the_seven_joint_arm_is_served_and_driven_over_vcan0(tmp_path: Path) -> None:
+    cycles = 300
+    script = ARM.format(python=sys.executable, scenario="canopen7_live", seconds=cycles / 100, out=tmp_path)
+    done = in_guest(tmp_path, script)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads((tmp_path / "drive.json").read_text())
+    assert (found["ended"], found["cycles"], found["missed"]) == ("done", cycles, 0)
+    assert found["lateness"]["max"] < 0.001
+    assert found["work"]["max"] < 0.01
+    assert max(found["joint_error"]) < 0.002
+    assert (tmp_path / "serve.txt").read_text().splitlines()[-1] == "ended; brakes closed: 7 of 7"
+
+    log = (tmp_path / "bus.log").read_text()
+    frames = re.findall(r"^\((\d+\.\d{6})\) vcan0 (\w{3})#(\w*)$", log, re.MULTILINE)
+    assert len(frames) == len(log.splitlines())
+    syncs = np.array([float(stamp) for stamp, name, _ in frames if name == "080"])
+    steady = np.diff(syncs)[-cycles:-10]  # before the stop
+    assert np.abs(steady - 0.01).max() < 0.001
+    record = RunLog.load(tmp_path / "canopen7_live_bus.h5")
+    for node in range(3, 10):
+        data = [bytes.fromhex(text) for _, name, text in frames if name == f"{0x180 + node:03X}"]
+        # TPDO 1: statusword, torque, and the position in millidegrees in its last four bytes
+        q = [math.radians(int.from_bytes(each[4:], "little", signed=True) / 1000) for each in data]
+        driven = record.ticks.q[:, node - 3]
+        matches = [k for k in range(len(q) - cycles + 1) if np.allclose(q[k : k + cycles], driven, atol=1e-12)]
+        assert len(matches) >= 1, node

@@ -19,7 +19,6 @@ from lwa4d_sim.interfaces import NS_PER_S, Array, Ns
 START = Ns(0)
 # Identifiers of CiA 301's predefined connection set.
 NMT, SYNC, FIRST_PDO, LAST_PDO, FIRST_REQUEST, LAST_REQUEST = 0x000, 0x080, 0x181, 0x57F, 0x601, 0x67F
-RPDOS = range(0x1400, 0x1404)
 
 
 class Physics(Protocol):
@@ -60,7 +59,6 @@ class BusArm:
     Args:
         plant: the arm.
         joints: what each drive knows about its joint.
-        first_node: node id of the first joint; the others follow.
         profile: which drive (`lwa4d` or `cia402`).
         source: the speed that the drives report; None = the true one.
         sender: given a node id, what puts that node's frames on the bus.
@@ -72,7 +70,6 @@ class BusArm:
         self,
         plant: Physics,
         joints: Sequence[Joint],
-        first_node: int,
         profile: Profile,
         source: SpeedSignal | None,
         sender: Callable[[int], Callable[[can.Message], None]],
@@ -87,19 +84,19 @@ class BusArm:
         self._pieces: list[tuple[Array, Array, Array]] = []
         self.drives: list[Drive] = []
         self.nodes: list[Node] = []
-        for k, joint in enumerate(joints):
-            dictionary = drive_dictionary(profile, first_node + k, joint)
+        for joint in joints:
+            dictionary = drive_dictionary(profile, joint.node, joint)
             # the drive reports through its node, which is made right after it
             emergency = _Emergency()
             drive = Drive(dictionary, joint, emergency.raised, emergency.recovered, self.catch_up)
-            node = Node(first_node + k, dictionary, sender(first_node + k), drive)
+            node = Node(joint.node, dictionary, sender(joint.node), drive)
             emergency.node = node
             self.drives.append(drive)
             self.nodes.append(node)
         self.deaf: set[int] = set()
         self._deadlines: list[Ns | None] = [None] * len(joints)
         self._listeners: dict[int, list[int]] = {}
-        self._settled = self._timed = False
+        self._settled = False
         self._measure()
 
     def power_on(self, now: Ns) -> Ns | None:
@@ -126,8 +123,8 @@ class BusArm:
         for k in concerned:
             node = self.nodes[k]
             node.receive(msg, now)
-            if set_point and not self._timed:
-                continue  # moves no timer
+            if set_point and self._deadlines[k] is not None:
+                continue  # a set-point only puts its timer off, and starts it before the next SYNC's poll
             self._deadlines[k] = mine = node.poll(now)
             if mine is not None and (deadline is None or mine < deadline):
                 deadline = mine
@@ -218,17 +215,10 @@ class BusArm:
         """Indices of the nodes that listen to an identifier now."""
         if not self._settled:
             self._listeners = {}
-            self._timed = any(_times_set_points(node) for node in self.nodes)
             for k, node in enumerate(self.nodes):
                 for each in node.data_ids if node.node_id not in self.deaf else ():
                     self._listeners.setdefault(each, []).append(k)
         return self._listeners.get(cob_id, ())
-
-
-def _times_set_points(node: Node) -> bool:
-    """Whether any RPDO has an event timer (14xx:5)."""
-    values = node.dictionary
-    return any((index, 5) in values and values[index, 5] for index in RPDOS)
 
 
 class _Emergency:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,11 +11,10 @@ from lwa4d_sim.assembly import Blocks
 from lwa4d_sim.bus.arm import BusArm
 from lwa4d_sim.bus.checks import check_bus
 from lwa4d_sim.bus.connect import Connection
-from lwa4d_sim.bus.dictionary import Joint
+from lwa4d_sim.bus.dictionary import Joint, drive_dictionary
 from lwa4d_sim.bus.faults import Faults
 from lwa4d_sim.bus.joints import joints_for
 from lwa4d_sim.bus.master import Master, Plan
-from lwa4d_sim.bus.options import FIRST_NODE
 from lwa4d_sim.bus.safety import Envelope, Following
 from lwa4d_sim.bus.session import Session
 from lwa4d_sim.bus.simulation import STARTUP, Simulation, add_traffic
@@ -72,7 +72,7 @@ def served_arm(blocks: Blocks, bus: Connection, *, epoch: Ns, per_sync: bool) ->
     loop = bus_loop(blocks.settings)
     source, _ = _speed(blocks, loop)
     step = to_ns(loop.period) if per_sync else None
-    arm = BusArm(blocks.plant, _joints(blocks), FIRST_NODE, loop.profile, source, lambda node: bus.send, epoch, step)
+    arm = BusArm(blocks.plant, _joints(blocks), loop.profile, source, lambda node: bus.send, epoch, step)
     _tune(arm, blocks)
     return arm
 
@@ -84,7 +84,8 @@ def driving_session(
     loop = bus_loop(blocks.settings)
     source, estimator = _speed(blocks, loop)
     plan = plan_for(blocks, loop, enable=enable)
-    check_bus(plan, loop.bit_rate, loop.traffic)
+    with blocks.about("loop"):
+        check_bus(plan, loop.bit_rate, loop.traffic)
     master = Master(bus, clock, plan)
     control = blocks.control(estimator)
     guard = Envelope(plan.joints)
@@ -100,6 +101,16 @@ def _following(blocks: Blocks) -> Following | None:
     return Following(blocks.infos[0].trajectory, loop.period, loop.following_error, names)
 
 
+def write_sheets(blocks: Blocks, folder: Path) -> list[Path]:
+    """Electronic data sheets of all drives, ``node3.eds`` and so on."""
+    folder.mkdir(parents=True, exist_ok=True)
+    profile, paths = bus_loop(blocks.settings).profile, []
+    for joint in _joints(blocks):
+        paths.append(folder / f"node{joint.node}.eds")
+        drive_dictionary(profile, joint.node, joint).export_eds(paths[-1], joint.node)
+    return paths
+
+
 def _tune(arm: BusArm, blocks: Blocks) -> None:
     """Tune each drive's own loops for what it moves at the start, the other joints free (assumed).
 
@@ -111,7 +122,7 @@ def _tune(arm: BusArm, blocks: Blocks) -> None:
 
 
 def _joints(blocks: Blocks) -> tuple[Joint, ...]:
-    return joints_for(blocks.settings.arm, joint_facts(blocks.model))
+    return joints_for(blocks.settings.arm, joint_facts(blocks.model), bus_loop(blocks.settings).nodes)
 
 
 def _speed(blocks: Blocks, loop: CanopenLoop) -> tuple[Any, Estimator]:

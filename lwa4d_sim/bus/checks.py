@@ -30,7 +30,7 @@ def check_bus(plan: Plan, bit_rate: int | None, traffic: Iterable[Traffic]) -> N
         raise ScenarioError(str(error), "loop.period") from error
     if plan.deadline >= plan.period:
         raise ScenarioError(f"must be below the period of {plan.period / NS_PER_S:g} s", "loop.deadline")
-    mine, others = _arm(plan), [Stream(can_id=one.id, period=to_ns(one.period), dlc=one.size) for one in traffic]
+    mine, others = arm_streams(plan), [Stream(can_id=one.id, period=to_ns(one.period), dlc=one.size) for one in traffic]
     seen = {stream.can_id for stream in mine}
     for i, stream in enumerate(others):
         if stream.can_id in seen:
@@ -54,17 +54,17 @@ def check_bus(plan: Plan, bit_rate: int | None, traffic: Iterable[Traffic]) -> N
         )
 
 
-def _arm(plan: Plan) -> list[Stream]:
+def arm_streams(plan: Plan) -> list[Stream]:
     """What master and drives send."""
     layout, streams = LAYOUTS[plan.profile], [Stream(can_id=SYNC, period=plan.period, dlc=0, name=MEASURED)]
-    for k in range(len(plan.joints)):
-        node = plan.first_node + k
+    for joint in plan.joints:
+        node = joint.node
         for base, name, pdos in ((0x180, MEASURED, layout.transmit), (0x200, "set-points", layout.receive)):
             for i, items in enumerate(pdos):
                 size = sum(bits for _, _, bits, _ in items) // 8
                 streams.append(Stream(can_id=base + 0x100 * i + node, period=plan.period, dlc=size, name=name))
     if plan.heartbeat:
         beat = Ns(plan.heartbeat * 1_000_000)
-        nodes = [MASTER_NODE, *(plan.first_node + k for k in range(len(plan.joints)))]
+        nodes = [MASTER_NODE, *(joint.node for joint in plan.joints)]
         streams += [Stream(can_id=0x700 + node, period=beat, dlc=1) for node in nodes]
     return streams

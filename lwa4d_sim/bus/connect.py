@@ -2,14 +2,17 @@
 
 import time
 from collections import deque
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import can
 
+from lwa4d_sim.bus.candump import CandumpLog
 from lwa4d_sim.errors import BusError
 
 RECENT = 256  # own frames remembered, to tell their echoes (assumed: many cycles' worth)
+PATIENCE = 10.0  # [s] for a log's last frames to reach the file (assumed)
 # Frames in a row that are skipped as echoes or unreadable before `recv` comes back empty-handed (assumed), so that
 # nobody who floods the bus with them keeps the caller from its other work.
 SKIPPED = 512
@@ -52,7 +55,7 @@ class Connection:
             if len(self._sent) > RECENT:
                 self._forget()
         if self.loggers:
-            self._log(_stamped(msg))
+            self._log(msg, time.time(), is_rx=False)
         self._bus.send(msg, timeout)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
@@ -74,7 +77,7 @@ class Connection:
                     self.unreadable += 1
                 elif not (self._pending and self._is_echo(msg)):
                     if self.loggers:
-                        self._log(msg)
+                        self._log(msg, msg.timestamp, is_rx=True)
                     return msg
             if end is not None:
                 timeout = max(0.0, end - time.monotonic())
@@ -84,15 +87,28 @@ class Connection:
         """Close the bus and the logs."""
         self._bus.shutdown()
         for logger in self.loggers:
-            logger.stop()
+            finish(logger)
 
-    def _log(self, msg: can.Message) -> None:
+    def _log(self, msg: can.Message, timestamp: float, *, is_rx: bool) -> None:
+        """Log a copy, without what a hostile datagram may have put into the other fields."""
+        copy = can.Message(
+            timestamp=timestamp,
+            arbitration_id=msg.arbitration_id,
+            is_extended_id=bool(msg.is_extended_id),
+            is_remote_frame=bool(msg.is_remote_frame),
+            is_error_frame=bool(msg.is_error_frame),
+            dlc=msg.dlc,
+            data=msg.data,
+            is_rx=is_rx,
+        )
         for logger in list(self.loggers):
             try:
-                logger(msg)
+                logger(copy)
             except Exception as error:  # a full disk must not stop the arm's cycle
                 self.loggers.remove(logger)
                 self.log_error = str(error)
+                with suppress(Exception):
+                    logger.stop()
 
     def _is_echo(self, msg: can.Message) -> bool:
         key = _key(msg)
@@ -120,20 +136,6 @@ def _key(msg: can.Message) -> _Key:
 def _is_about_content(error: can.CanOperationError) -> bool:
     """Whether one datagram was bad, not the bus: python-can reports both alike, but for what caused it."""
     return error.__cause__ is not None and not isinstance(error.__cause__, OSError)
-
-
-def _stamped(msg: can.Message) -> can.Message:
-    """A frame that is being sent, as it is to be logged."""
-    return can.Message(
-        timestamp=time.time(),
-        arbitration_id=msg.arbitration_id,
-        is_extended_id=msg.is_extended_id,
-        is_remote_frame=msg.is_remote_frame,
-        is_error_frame=msg.is_error_frame,
-        dlc=msg.dlc,
-        data=msg.data,
-        is_rx=False,
-    )
 
 
 def connect(interface: str, channel: str, bit_rate: int | None = None) -> Connection:
@@ -164,7 +166,9 @@ def connect(interface: str, channel: str, bit_rate: int | None = None) -> Connec
     except (can.CanError, OSError, ValueError, TypeError, ImportError, AttributeError, OverflowError) as error:
         reason = str(error) or type(error).__name__
         raise BusError(f"cannot open {interface} channel '{channel}': {' '.join(reason.split())}") from error
-    return Connection(bus, echoes=interface == "udp_multicast")
+    made = Connection(bus, echoes=interface == "udp_multicast")
+    made.channel_info = f"{interface} channel '{channel}'"  # not every bus knows its own
+    return made
 
 
 def log_to(bus: Connection, path: Path | None) -> None:
@@ -185,6 +189,18 @@ def frame_writer(path: Path) -> can.Listener:
         BusError: no such format, a library for it is missing, or the file cannot be written.
     """
     try:
-        return can.Logger(path)
+        return CandumpLog(path) if path.suffix.lower() == ".log" else can.Logger(path)
     except (ValueError, OSError, ImportError, NotImplementedError) as error:
         raise BusError(f"{path}: cannot log frames: {error}") from error
+
+
+def finish(writer: can.Listener) -> None:
+    """Close a file of frames.
+
+    python-can's SQLite writer has a thread of its own and throws away what that has not taken from its queue by then.
+    """
+    queue = getattr(writer, "buffer", None)
+    end = time.monotonic() + PATIENCE
+    while queue is not None and not queue.empty() and time.monotonic() < end:
+        time.sleep(0.01)
+    writer.stop()

@@ -10,6 +10,7 @@ from typing import Any, Literal, cast
 from canopen.objectdictionary import ObjectDictionary, datatypes
 
 from lwa4d_sim.bus import sheet
+from lwa4d_sim.bus.options import FIRST_NODE
 from lwa4d_sim.bus.entry import NO_OBJECT, NO_SUB_INDEX, RANGES, READ_ONLY, STRUCTS, WRITE_ONLY, Abort, Access, Entry
 from lwa4d_sim.bus.mapping import Key
 from lwa4d_sim.bus.objects import EXTENSION, EXTENSION_PDOS, FIRMWARE, FIRMWARE_PDOS, pdo_rows
@@ -172,6 +173,7 @@ class Joint:
         acceleration: largest acceleration [rad/s^2].
         torque: peak torque [N m].
         torque_constant: joint torque a current gives [N m/A].
+        node: id of its drive.
     """
 
     name: str
@@ -181,6 +183,7 @@ class Joint:
     acceleration: float
     torque: float
     torque_constant: float = 10.0  # gear 100 x 0.1 N m/A of the ERB 115 (AndreaGiusti/OTFCtrlModRob); upper bound
+    node: int = FIRST_NODE
 
 
 def drive_dictionary(profile: Literal["lwa4d", "cia402"], node_id: int, joint: Joint) -> Dictionary:

@@ -6,6 +6,7 @@ none, and there every stop is the quick stop ramp and then the brake (lwa4d-fact
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 from lwa4d_sim.bus import alarms
 from lwa4d_sim.bus.axis import RAD_PER_MDEG, Axis
@@ -88,8 +89,6 @@ class Drive:
     def brake_works(self, works: bool) -> None:
         self.brake.works = works
 
-    # What the plant asks
-
     def measure(self, q: float, dq: float, shown: float | None = None) -> None:
         """Take the joint's angle [rad] and speed [rad/s], and the speed that 606C is to show, if it is another."""
         axis = self.axis
@@ -155,8 +154,6 @@ class Drive:
         self._clipped = not low <= tau <= high
         return min(max(tau, low), high)
 
-    # What the node asks (its Device)
-
     def reset(self, now: Ns) -> None:
         """As after power-on: brake closed, SWITCH ON DISABLED."""
         self._now = now
@@ -166,6 +163,7 @@ class Drive:
         self._servo, self._supervision = Servo(axis), Supervision(axis)
         self.steering = Steering(axis, self.brake, self._servo, self.fail)
         self._clipped = False
+        self._parameters: dict[tuple[int, int], Any] = {}  # as last taken over
         self._faults.active.clear()
         self._blind = False
         self.steering.search(done=self._searched_before)
@@ -211,6 +209,8 @@ class Drive:
                 if mode.loop is Loop.TORQUE:
                     self._settle(now)
             return
+        if self._parameters.get((index, sub)) == value and index != 0x60FE:
+            return
         if index == 0x6060:
             if not steering.has(value):
                 raise Abort(INVALID)
@@ -220,6 +220,7 @@ class Drive:
             self.brake.by_hand(dictionary[0x60FE, 1], dictionary[0x60FE, 2], in_control=in_control)
         elif (index == 0x6098 and value not in METHODS) or (index in LOOP_PARAMETERS and not 0 <= value < math.inf):
             raise Abort(INVALID)
+        self._parameters[index, sub] = value
         self.axis.load()
         self._settle(now)
 
@@ -250,8 +251,6 @@ class Drive:
         self.steering.ask(Command.QUICK_STOP)
         self._settle(now)
         return None
-
-    # Inside
 
     def fail(self, code: int, *, report: bool = True) -> bool:
         """A fault: its reaction and, once, its emergency. Whether it is new and so changes anything.

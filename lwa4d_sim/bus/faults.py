@@ -66,7 +66,7 @@ class Faults:
             key = f"loop.faults.{i}"
             node = getattr(fault, "node", None)
             if node is not None and node not in nodes:
-                known = f"{min(nodes)} to {max(nodes)}" if len(nodes) > 1 else f"{min(nodes)}"
+                known = ", ".join(map(str, nodes))
                 raise ScenarioError(f"no drive has this node id; they have {known}", f"{key}.node")
             self._install(fault, key, nodes[node] if node is not None else None)
         if self._tamper.rules or any(isinstance(fault, HeartbeatLoss) for fault in faults):

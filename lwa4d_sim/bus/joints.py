@@ -5,7 +5,8 @@ from collections.abc import Sequence
 
 from lwa4d_sim.arm import ARMS, MODULES
 from lwa4d_sim.bus.dictionary import Joint
-from lwa4d_sim.errors import BusError
+from lwa4d_sim.bus.options import FIRST_NODE
+from lwa4d_sim.errors import BusError, ScenarioError
 
 # [rad/s^2], schunk_lwa4d, config/arm_cartesian_controller.yaml ("taken from MTS"), joint 1 to 7
 ACCELERATION = (2.79, 2.79, 2.65, 2.65, 2.79, 8.73, 8.73)
@@ -18,17 +19,21 @@ OTHER_SPEED, OTHER_ACCELERATION = math.pi, 10.0
 Facts = Sequence[tuple[str, tuple[float, float] | None, float]]
 
 
-def joints_for(arm: str, facts: Facts) -> tuple[Joint, ...]:
+def joints_for(arm: str, facts: Facts, nodes: Sequence[int] | None = None) -> tuple[Joint, ...]:
     """Constants of each joint of an arm.
 
     Args:
         arm: name of a shipped arm, or anything else.
         facts: name, position limits [rad] or None, and peak torque [N m] of each joint.
+        nodes: node id of each joint; default the real arm's, for another arm 3 and up.
 
     Raises:
+        ScenarioError: not one node a joint.
         BusError: a joint without a torque limit, in whose per mille the drive could count.
     """
     numbers = [link.joint for link in ARMS[arm].links] if arm in ARMS else None
+    if nodes is not None and (len(nodes) != len(facts) or len(set(nodes)) != len(nodes)):
+        raise ScenarioError(f"must be {len(facts)} different node ids, one for each joint", key="loop.nodes")
     made = []
     for k, (name, limits, peak) in enumerate(facts):
         if not math.isfinite(peak):
@@ -44,6 +49,7 @@ def joints_for(arm: str, facts: Facts) -> tuple[Joint, ...]:
                 acceleration=ACCELERATION[module] if module is not None else OTHER_ACCELERATION,
                 torque=peak,
                 torque_constant=TORQUE_CONSTANT,
+                node=nodes[k] if nodes is not None else FIRST_NODE + (k if module is None else module),
             )
         )
     return tuple(made)

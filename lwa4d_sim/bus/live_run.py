@@ -13,7 +13,7 @@ from lwa4d_sim.bus.commission import commission
 from lwa4d_sim.bus.connect import Connection
 from lwa4d_sim.bus.master import Master
 from lwa4d_sim.bus.options import Profile
-from lwa4d_sim.bus.process import undisturbed
+from lwa4d_sim.bus.process import CONTROLLER, undisturbed
 from lwa4d_sim.bus.serve import monotonic
 from lwa4d_sim.bus.session import Cycle, Session
 from lwa4d_sim.bus.stations import opening
@@ -133,7 +133,7 @@ def drive_arm(
         bus: open.
         stopped: asked in every cycle whether to end.
         seconds: longest duration [s]; default that of the motion.
-        realtime: as in `undisturbed`.
+        realtime: ahead of all ordinary processes.
 
     Raises:
         BusError: no real-time scheduling here, or the drives cannot be set up.
@@ -142,7 +142,8 @@ def drive_arm(
     ticks = blocks.timing.ticks if seconds is None else min(blocks.timing.ticks, math.ceil(seconds / loop.period))
     master, session = driving_session(blocks, bus, monotonic, enable=True)
     live = LiveRun(blocks, master, session)
-    with undisturbed(realtime=realtime):  # from before the set-up: what it does takes longer than a heartbeat time-out
+    # begun before the set-up, since what it does takes longer than the drives wait for a heartbeat
+    with undisturbed(CONTROLLER if realtime else None):
         live.set_up(loop.profile)
         ended = live.run(ticks, stopped)
     return live, {**live.summary(), "ended": ended}

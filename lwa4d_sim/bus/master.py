@@ -11,7 +11,7 @@ import can
 
 from lwa4d_sim.bus.client import Client
 from lwa4d_sim.bus.dictionary import Joint
-from lwa4d_sim.bus.options import FIRST_NODE, Profile
+from lwa4d_sim.bus.options import Profile
 from lwa4d_sim.bus.stations import (
     CONTROL,
     LAYOUTS,
@@ -37,6 +37,7 @@ MASTER_NODE = 127  # as which the master's heartbeat is heard (schunk_pg70, Schu
 HEARTBEAT_MS = 100  # LWA 4P's DCF; the LWA4D's leaves it off
 TRIES = 50  # SYNC cycles a state change may take (assumed)
 SYNCHRONOUS, EVENT = 1, 255  # PDO transmission types
+DEFIED_LIMIT = 3  # cycles in which a drive may overlook a quick stop (assumed)
 OVERTIME = 1_000_000  # [ns] for which frames that had arrived are taken in beyond an instant, were it a flood (assumed)
 
 
@@ -46,10 +47,9 @@ class Plan:
 
     Attributes:
         profile: of the drives.
-        joints: constants of each joint, in the order of the node ids.
+        joints: constants of each joint.
         period: SYNC period [ns].
         immediate: commands act when they arrive, not at the next SYNC.
-        first_node: node id of the first joint.
         heartbeat: producer time of the drives and the master [ms], 0 = off.
         deadline: from the SYNC [ns] to when a cycle no longer waits for measurements.
         enable: let the drives move; without it they stay switched on with closed brakes.
@@ -59,7 +59,6 @@ class Plan:
     joints: tuple[Joint, ...]
     period: Ns
     immediate: bool = False
-    first_node: int = FIRST_NODE
     heartbeat: int = HEARTBEAT_MS
     deadline: Ns
     enable: bool = True
@@ -91,7 +90,7 @@ class Master:
     def __init__(self, bus: Bus, clock: Callable[[], Ns], plan: Plan) -> None:
         self.bus, self.clock, self.plan = bus, clock, plan
         self.layout = LAYOUTS[plan.profile]
-        self.stations = [Station(plan.first_node + k, joint) for k, joint in enumerate(plan.joints)]
+        self.stations = [Station(joint.node, joint) for joint in plan.joints]
         self.client = Client(self.send, lambda timeout, done: self.wait(Ns(self.clock() + round(timeout * 1e9)), done))
         self.watch = Watch(self.stations, plan.period, plan.heartbeat)
         self._by_node = {station.node: station for station in self.stations}
@@ -159,20 +158,23 @@ class Master:
         if len(msg.data) < mapping.size:
             self.watch.ignored(station, f"TPDO of {len(msg.data)} bytes ignored", self.clock())
             return
+        data = bytes(msg.data)
         if station.fresh & bit:
-            # Frames have no number. One kind keeps its order on the wire, so the second is newer only if the first
-            # was that of the cycle before; else it is a copy, or older.
-            if not station.owed & bit:
-                self.watch.ignored(station, "a second TPDO in one cycle ignored", self.clock())
+            # Frames have no number. Those of one kind keep their order on the wire, so the last is the newest, unless
+            # it is a copy of one of the cycle before.
+            if data == station.before.get(bit):
+                self.watch.ignored(station, "copy of an older TPDO ignored", self.clock())
                 return
             station.owed &= ~bit
-        station.values.update(mapping.unpack(msg.data))
+        station.frames[bit] = data
+        station.values.update(mapping.unpack(data))
         station.fresh |= bit
         if station.fresh == self._all and not station.owed and not station.complete:
             station.complete = True
             self._waiting -= 1
         if bit == 1:
             station.stamp, station.since = self.sync_at, self.clock()
+            station.missed = 0  # late, for the cycle that did not wait for it, but not lost
 
     # -- one cycle ---------------------------------------------------------------------------------------------------
 
@@ -181,6 +183,7 @@ class Master:
         for station in self.stations:
             station.owed = 0 if station.stamp == NEVER else self._all & ~station.fresh
             station.fresh, station.complete = 0, False
+            station.before, station.frames = station.frames, {}
         self._waiting = len(self.stations)
         self.sync_at = self.clock()
         self.frame(SYNC, b"")
@@ -214,23 +217,25 @@ class Master:
             # whichever position the drive looks at, it is to see no error there
             values[SET_POINT] = values[TARGET_POSITION] = values.get(POSITION, 0)
             for i, mapping in enumerate(self._receive):
-                self.frame(0x200 + 0x100 * i + station.node, mapping.pack(values.__getitem__))
+                self.frame(0x200 + 0x100 * i + station.node, mapping.pack_from(values))
 
     # -- the end -----------------------------------------------------------------------------------------------------
 
     def halt(self) -> None:
         """One step towards standstill: quick stop to the drives that move, no voltage to those that have stopped.
 
-        A drive that sends no measurements may not take set-points either. NMT stop makes it stop by itself (6007).
+        A drive that sends no measurements may not take set-points either, and one that does not obey does not. NMT
+        stop makes it stop by itself (6007).
         """
         for station in self.stations:
-            if station.missed:
+            station.defied = station.defied + 1 if station.status & STATE_MASK == ENABLED else 0
+            if station.missed or station.defied > DEFIED_LIMIT:
                 self.frame(NMT, bytes([STOP, station.node]))
             moving = station.status & STATE_MASK in (ENABLED, QUICK_STOP_ACTIVE)
             station.values[CONTROL] = QUICK_STOP if moving else DISABLE_VOLTAGE
             station.values[self.layout.torque] = 0
             for i, mapping in enumerate(self._receive):
-                self.frame(0x200 + 0x100 * i + station.node, mapping.pack(station.values.__getitem__))
+                self.frame(0x200 + 0x100 * i + station.node, mapping.pack_from(station.values))
 
     def stop(self) -> None:
         """Quick stop until no drive moves, then switch off; a silent drive is not waited for.
@@ -249,9 +254,16 @@ class Master:
             self.halt()
             self.wait(Ns(start + self.plan.period))
         self.command(None, DISABLE_VOLTAGE)
+        # each of these waits for the one before: SYNC is more urgent than set-points, and NMT than SYNC
+        self.wait(Ns(self.clock() + self.plan.period))
         self.sync()
+        self.gather()
+        self.let_go()
+        self.wait(Ns(self.clock() + self.plan.period))
+
+    def let_go(self) -> None:
+        """Leave the drives pre-operational, where they take no set-points."""
         for station in self.stations:
             if station.missed:
                 self.frame(NMT, bytes([STOP, station.node]))
             self.frame(NMT, bytes([PRE_OPERATIONAL, station.node]))
-        self.wait(Ns(self.clock() + self.plan.period))

@@ -1,4 +1,4 @@
-"""What a scenario may say about a CANopen bus: rate, profile, noise, other traffic and scripted faults."""
+"""What a scenario may say about a CANopen bus: rate, profile, noise and other traffic."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
@@ -9,7 +9,7 @@ from lwa4d_sim.interfaces import STRICT, NonNegative, Positive
 
 Profile = Literal["lwa4d", "cia402"]
 
-FIRST_NODE = 3  # node id of joint 1 (schunk_lwa4d, config/arm_driver.yaml); the arm's joints are 3 to 9
+FIRST_NODE = 3  # node id of joint 1; joint 7 has 9 (schunk_lwa4d, config/arm_driver.yaml)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,9 @@ from types import FrameType
 
 from lwa4d_sim.errors import BusError
 
-PRIORITY = 50  # under SCHED_FIFO, 1 to 99 (assumed: above user programs, at the level of threaded interrupts)
+# Under SCHED_FIFO, 1 to 99 (assumed: at the level of threaded interrupts). On one processor the controller, whose SYNC
+# is everybody's clock, goes before the arm.
+CONTROLLER, ARM = 50, 49
 _MCL_CURRENT = 1  # flag of mlockall, <asm-generic/mman.h>
 
 
@@ -49,14 +51,14 @@ def stoppable() -> Iterator[Stop]:
 
 
 @contextmanager
-def undisturbed(*, realtime: bool = False) -> Iterator[None]:
-    """No collection of garbage; with ``realtime`` ahead of all ordinary processes, and not paged out.
+def undisturbed(priority: int | None = None) -> Iterator[None]:
+    """No collection of garbage; with a ``priority`` ahead of all ordinary processes, and not paged out.
 
     Raises:
         BusError: the system does not allow it.
     """
-    if realtime:
-        go_first()
+    if priority is not None:
+        go_first(priority)
     was_on = gc.isenabled()
     gc.collect()
     gc.freeze()
@@ -69,14 +71,14 @@ def undisturbed(*, realtime: bool = False) -> Iterator[None]:
             gc.enable()
 
 
-def go_first() -> None:
+def go_first(priority: int) -> None:
     """Schedule this process by SCHED_FIFO and lock its memory, to its end.
 
     Raises:
         BusError: the system does not allow it.
     """
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except (AttributeError, OSError) as error:  # not on Linux, or neither root nor allowed by RLIMIT_RTPRIO
         raise BusError(f"--realtime: this system does not grant SCHED_FIFO: {error}") from error
     ctypes.CDLL(None).mlockall(_MCL_CURRENT)  # where it is refused, paging remains possible

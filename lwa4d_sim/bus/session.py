@@ -93,8 +93,8 @@ class Session:
             begun = master.clock()
             gone = (begun - due) // period
             if gone:
-                self.late += min(gone, ticks - k)
-                k += gone
+                self.late += min(gone + 1, ticks - k)
+                k += gone + 1
                 continue
             self.lateness.append(Ns(begun - due))
             cycle = self._cycle(k, start, first)

@@ -1,6 +1,8 @@
 """The object dictionary as an electronic data sheet (EDS), by way of the canopen library."""
 
+import re
 from collections.abc import Iterable, Mapping
+from io import StringIO
 from pathlib import Path
 from typing import Any, cast
 
@@ -8,9 +10,12 @@ from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVari
 
 from lwa4d_sim.bus.entry import Entry
 from lwa4d_sim.bus.mapping import DUMMIES
+from lwa4d_sim.errors import BusError
 
 BIT_RATE = 500_000  # [bit/s] of the arm (schunk_robots, schunk_lwa4d/config/can0.yaml)
 BIT_RATES = {50_000, 125_000, 250_000, 500_000, 1_000_000}  # EDS 0.63
+LAST_SUB_INDEX = 254  # CiA 301, 7.4.3
+_COMPACT = re.compile(r"^\[(\w+)\][^\[]*?^CompactSubObj\s*=\s*(\S+)", re.MULTILINE | re.IGNORECASE)
 RECORDS = (0x1018, *range(0x1200, 0x1C00))  # identity, SDO and PDO parameters are records even if all members are alike
 
 
@@ -56,6 +61,29 @@ def export(od: ObjectDictionary, path: str | Path) -> None:
         about |= {f"{what}Date": "01-01-2026", f"{what}Time": "12:00AM"}
     with open(path, "w", encoding="ascii", newline="\n") as file:
         eds.export_eds(od, file, about)  # type: ignore[no-untyped-call]
+
+
+def load(path: Path, node_id: int | None = None) -> ObjectDictionary:
+    """Read a data sheet (EDS) or a configuration (DCF).
+
+    Raises:
+        BusError: the file is not there, or is none.
+    """
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise BusError(f"{path}: cannot read the data sheet: {error.strerror or error}") from error
+    for index, count in _COMPACT.findall(text):
+        if not count.isdecimal() or int(count) > LAST_SUB_INDEX:  # the library would make them all, were it billions
+            raise BusError(f"{path}: no data sheet: [{index}] has CompactSubObj={count}, not 0 to {LAST_SUB_INDEX}")
+    try:
+        od = eds.import_eds(StringIO(text), node_id)  # type: ignore[no-untyped-call]
+    except Exception as error:  # the library lets through whatever its parser meets
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise BusError(f"{path}: no data sheet: {reason}") from error
+    if not len(od):
+        raise BusError(f"{path}: no data sheet: it lists no object")
+    return cast(ObjectDictionary, od)
 
 
 def _variable(entry: Entry, node_id: int) -> ODVariable:

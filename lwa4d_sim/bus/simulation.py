@@ -10,7 +10,7 @@ from lwa4d_sim.bus.arm import BusArm, Physics, SpeedSignal
 from lwa4d_sim.bus.commission import commission
 from lwa4d_sim.bus.dictionary import Joint
 from lwa4d_sim.bus.master import Master, Plan
-from lwa4d_sim.bus.options import FIRST_NODE, Profile, Traffic
+from lwa4d_sim.bus.options import Profile, Traffic
 from lwa4d_sim.bus.safety import Following
 from lwa4d_sim.bus.session import Control, Session
 from lwa4d_sim.bus.stations import opening
@@ -44,7 +44,7 @@ class Simulation:
         self.ports: dict[int, WirePort] = {}
         self.cut: set[int] = set()  # nodes that are off the bus, as a fault
         self.notes: list[tuple[Ns, str]] = []
-        self.arm = BusArm(plant, joints, FIRST_NODE, profile, source, self._sender)
+        self.arm = BusArm(plant, joints, profile, source, self._sender)
         self._timer = Ns(2**62)
         self._remind(self.arm.power_on(wire.now))
 
@@ -129,7 +129,7 @@ class Simulation:
         """What a node's own controller reports: an error state, in which it may be deaf as well."""
         if msg.is_error_frame:
             self.arm.silence(node, deaf=self.ports[node].counters.off or node in self.cut)
-            self.arm.nodes[node - FIRST_NODE].receive(msg, now)
+            next(each for each in self.arm.nodes if each.node_id == node).receive(msg, now)
 
     def _received(self, msg: can.Message, now: Ns) -> None:
         self._remind(self.arm.receive(msg, now))

@@ -94,7 +94,9 @@ class Station:
         fresh: TPDOs of this cycle that have arrived, as bits.
         owed: TPDOs that did not come in the cycle before, as bits; what comes now may be these.
         complete: all TPDOs of this cycle have arrived.
+        frames, before: contents of the TPDOs of this cycle and of the one before, by those bits.
         missed: cycles in a row without TPDO 1.
+        defied: cycles in a row in which it has not followed a quick stop.
         alive: last sign of life on the error control channel [ns].
         nmt: state it last told there, or None.
         emergency: last error code reported and not taken back, 0 = none.
@@ -110,7 +112,10 @@ class Station:
     fresh: int = 0
     owed: int = 0
     complete: bool = False
+    frames: dict[int, bytes] = field(default_factory=dict)
+    before: dict[int, bytes] = field(default_factory=dict)
     missed: int = 0
+    defied: int = 0
     alive: Ns = NEVER
     nmt: int | None = None
     emergency: int = 0

@@ -13,7 +13,8 @@ MOVING = (ENABLED, 0x07, 0x0F, 0x2F)  # the others: quick stop active, fault rea
 OPERATIONAL, BOOT_UP = 0x05, 0x00  # CiA 301, states in the heartbeat
 MISSED_LIMIT = 3  # cycles without measurements: transmission type + 2, as ros_canopen counts (canopen_master, pdo.cpp)
 HEARTBEATS = 3  # producer times without a heartbeat (ros_canopen, node.cpp)
-NMT, SYNC, START = 0x000, 0x080, 0x01  # CiA 301, predefined connection set; NMT command
+NMT, SYNC = 0x000, 0x080  # CiA 301, predefined connection set
+TAKES_OVER = (0x02, 0x80, 0x81, 0x82)  # NMT commands that end the operational state
 SET_POINTS = range(0x200, 0x580)  # where RPDOs lie, between TPDOs
 # Emergencies that are no reason to stop: CAN overrun, error passive (CiA 301, table 26).
 WARNINGS = frozenset({0x8110, 0x8120})
@@ -55,7 +56,7 @@ class Watch:
         if cob_id == SYNC:
             self._once(now, "another SYNC producer is on the bus")
         elif cob_id == NMT:
-            if len(data) == 2 and data[0] != START and (not data[1] or data[1] in self._by_node):
+            if len(data) == 2 and data[0] in TAKES_OVER and (not data[1] or data[1] in self._by_node):
                 self._once(now, f"another master sends NMT command 0x{data[0]:02X}")
         elif cob_id in SET_POINTS and cob_id & 0x80 == 0 and cob_id & 0x7F in self._by_node:
             self._once(now, f"another master sends set-points to node {cob_id & 0x7F}")
