@@ -486,7 +486,9 @@ class Push:
         return JointState(q, np.zeros_like(q)), 20.0 * (0.3 - q)
 
 
-JOINTS = tuple(Joint(name=f"joint{k}", low=-2.0, high=2.0, speed=1.0, acceleration=5.0, torque=40.0) for k in range(3))
+JOINTS = tuple(
+    Joint(node=3 + k, name=f"joint{k}", low=-2.0, high=2.0, speed=1.0, acceleration=5.0, torque=40.0) for k in range(3)
+)
 
 
 class Bench:

@@ -451,7 +451,12 @@ def test_a_cycle_that_takes_too_long_costs_its_slots_and_no_burst_follows(fast: 
 def test_a_process_that_sleeps_too_long_goes_on_at_the_next_slot(fast: Path, ms: int, missed: int) -> None:
     rig = Rig(fast)
     calls = iter(range(50))
-    assert rig.live.run(50, lambda: next(calls) == 19 and rig.wire.run_until(Ns(rig.wire.now + ms * MS))) == "done"
+
+    def oversleep() -> None:
+        if next(calls) == 19:
+            rig.wire.run_until(Ns(rig.wire.now + ms * MS))
+
+    assert rig.live.run(50, oversleep) == "done"
     assert rig.session.late == missed
     syncs = np.array(rig.syncs()[: 50 - missed])
     slots, off = np.divmod(syncs - syncs[0], 10 * MS)

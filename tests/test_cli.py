@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 from lwa4d_sim import RunLog, cli, results
+from lwa4d_sim.console import scenario_path
 
 ROOT = Path(__file__).parent.parent
 

@@ -40,6 +40,10 @@ NOT_RUN = {
     "pip install ": "changes the environment; tests/test_wheel.py installs what ships",
     "apt-get ": "changes the computer",
     "pytest": "these very tests",
+    "lwa4d-sim bus serve": "waits for a master; tests/test_bus_live.py",
+    "lwa4d-sim bus drive": "needs somebody who serves; tests/test_bus_live.py",
+    "lwa4d-sim bus check": "needs a bus; tests/test_bus_cli.py",
+    "lwa4d-sim bus replay": "needs a bus; tests/test_bus_live.py",
     "lwa4d-sim batch scenarios": "tests/test_thesis.py runs the same files",
     "lwa4d-sim run pd_joint_p2.5 --video": "needs OpenGL; tests/test_video.py",
 }

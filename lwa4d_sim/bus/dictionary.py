@@ -10,10 +10,10 @@ from typing import Any, Literal, cast
 from canopen.objectdictionary import ObjectDictionary, datatypes
 
 from lwa4d_sim.bus import sheet
-from lwa4d_sim.bus.options import FIRST_NODE
 from lwa4d_sim.bus.entry import NO_OBJECT, NO_SUB_INDEX, RANGES, READ_ONLY, STRUCTS, WRITE_ONLY, Abort, Access, Entry
 from lwa4d_sim.bus.mapping import Key
 from lwa4d_sim.bus.objects import EXTENSION, EXTENSION_PDOS, FIRMWARE, FIRMWARE_PDOS, pdo_rows
+from lwa4d_sim.bus.options import FIRST_NODE
 
 __all__ = ["GROUPS", "Abort", "Dictionary", "Entry", "Group", "Joint", "drive_dictionary"]
 
