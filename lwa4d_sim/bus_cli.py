@@ -127,6 +127,9 @@ def drive(
     variant: _Variant = None,
     overrides: Set = None,
     arm: Annotated[bool, typer.Option("--arm", help="Really enable the drives. Without it: a dry run.")] = False,
+    torque: Annotated[
+        float, typer.Option(metavar="SHARE", min=0.0, max=1.0, help="Share of the peak torques that may go out.")
+    ] = 1.0,
     log: _Log = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", metavar="DIR", help="Write the record here.")] = None,
     seconds: _Seconds = None,
@@ -150,7 +153,7 @@ def drive(
     try:
         log_to(bus, log)
         with stoppable() as stop:
-            live, found = drive_arm(blocks, bus, stop, seconds=seconds, realtime=realtime)
+            live, found = drive_arm(blocks, bus, stop, seconds=seconds, realtime=realtime, torque=torque)
     finally:
         bus.shutdown()
     print(json.dumps(found) if as_json else report(found))

@@ -20,7 +20,7 @@ from lwa4d_sim.bus.frames import (
     worst_bits,
 )
 
-# shared/reference/can.md, section 5: equal to can-utils' canframelen with CFL_EXACT.
+# Equal to can-utils' canframelen with CFL_EXACT.
 VECTORS = {
     "080#": 51,
     "000#0103": 68,

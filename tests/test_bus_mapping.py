@@ -71,7 +71,7 @@ def test_bits_lie_where_the_standard_puts_them(drawn: tuple[list[Item], dict[Key
 def library_maps(draw: st.DrawFn) -> list[tuple[int, int, int]]:
     """(data type, bits, value): whole bytes of every type, or unsigned parts of a byte that stay inside it.
 
-    More the canopen library does not pack right (can.md, section 2.3).
+    More the canopen library does not pack right.
     """
     fields: list[tuple[int, int, int]] = []
     used = 0

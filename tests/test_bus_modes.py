@@ -135,7 +135,7 @@ def test_halt_stops_a_move_and_its_end_lets_it_go_on(profile: Profile) -> None:
     bench.run(20)
     assert bench.state is State.OPERATION_ENABLED
     assert bench.bit(12)
-    assert bench.drive.braked is (profile == "lwa4d")  # lwa4d-facts 6.3
+    assert bench.drive.braked is (profile == "lwa4d")  # schunk_canopen_driver, SchunkPowerBallNode
     q = bench.q
     bench.run(300)
     assert bench.q == pytest.approx(q, abs=1e-3)

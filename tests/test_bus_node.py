@@ -733,7 +733,7 @@ def test_what_was_latched_does_not_outlive_the_operational_state(running: Bench)
     assert running.device.named("written") == []
 
 
-# What LocalNode of the canopen library fails (can.md, section 2.1) and no other test here asks.
+# What LocalNode of the canopen library fails and no other test here asks.
 
 
 def test_frames_that_are_not_ours_have_no_effect(running: Bench) -> None:

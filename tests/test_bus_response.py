@@ -198,7 +198,7 @@ def test_the_wire_reaches_the_bound_in_the_critical_instant(load: tuple[list[Str
 
 
 def can_open(bit_rate: int, pairs: int) -> dict[str, Response]:
-    """The traffic of shared/reference/can.md, section 5, by name."""
+    """SYNC, PDOs, EMCY, SDO and heartbeats of seven drives at 10 ms, by name."""
     nodes, cycle = range(3, 10), ms(10)
     streams = [Stream(name="SYNC", can_id=0x80, dlc=0, period=cycle)]
     streams += [Stream(name=f"EMCY {n}", can_id=0x80 + n, period=ms(1000)) for n in nodes]

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from lwa4d_sim.bus.device import Loss
 
-# Codes of CiA 301 and 402; all but 8100 and 8140 are in the list of SCHUNK's modules (lwa4d-facts 6.6).
+# Codes of CiA 301 and 402; all but 8100 and 8140 are in the list of SCHUNK's modules (libPowerballArm, schunkErrors.h).
 OVERHEATED = 0x4210
 PARAMETER = 0x6320
 COMMUTATION = 0x7122

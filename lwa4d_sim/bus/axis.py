@@ -7,12 +7,12 @@ from lwa4d_sim.bus.dictionary import Dictionary, Joint
 from lwa4d_sim.bus.motion import Point
 from lwa4d_sim.interfaces import NS_PER_S, Ns
 
-RAD_PER_MDEG = math.pi / 180_000  # positions are millidegrees at the joint (lwa4d-facts, section 3)
+RAD_PER_MDEG = math.pi / 180_000  # positions are millidegrees at the joint (schunk_canopen_driver)
 MDEG_S_PER_RPM = 6000  # 6080 is in revolutions per minute of the joint
 MS = 1_000_000  # [ns]
 
 # Reflected rotor inertia per newton metre of peak torque [kg m^2 / (N m)]: 0.19 at the 19 N m of an ERB 115
-# (identified, lwa4d-facts 1.5); ASSUMED for all modules. Only the gains of the drive's own loops follow from it.
+# (identified: OTFCtrlModRob, init_SchunkModDB.m); ASSUMED for all modules. Only the gains of its own loops follow.
 INERTIA_PER_TORQUE = 0.01
 
 STANDSTILL = 0.3 * 1000 * RAD_PER_MDEG  # [rad/s] slower is standing, where 606F is absent or zero (assumed: 0.3 deg/s)
@@ -57,7 +57,7 @@ class Axis:
         polarity = get(0x607E)
         self.position_count = -RAD_PER_MDEG if polarity & 0x80 else RAD_PER_MDEG
         self.speed_count = -RAD_PER_MDEG if polarity & 0x40 else RAD_PER_MDEG
-        # the firmware's rule, lwa4d-facts section 3: count [mdeg/s] = denominator / numerator / 6000
+        # the firmware's rule, socanmatic, schunk.eds: count [mdeg/s] = denominator / numerator / 6000
         self.velocity_count = get(0x604C, 2) / (get(0x604C, 1) or 1) / MDEG_S_PER_RPM * self.speed_count or RAD_PER_MDEG
         self.newton_metres = get(0x6076) / 1e6 if self.full else joint.torque_constant / 1000
 

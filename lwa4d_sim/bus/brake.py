@@ -45,7 +45,7 @@ class Brake:
         return True
 
     def by_hand(self, outputs: int, mask: int, *, in_control: bool) -> None:
-        """Digital outputs 60FE: bit 0 = 0 opens the brake of an axis that is not in control (lwa4d-facts 6.5).
+        """Digital outputs 60FE: bit 0 = 0 opens the brake of an axis that is not in control (schunk_powerball.cpp).
 
         ASSUMED: the mask must let bit 0 through, as CiA 402 has it.
         """

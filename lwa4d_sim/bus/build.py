@@ -78,9 +78,9 @@ def served_arm(blocks: Blocks, bus: Connection, *, epoch: Ns, per_sync: bool) ->
 
 
 def driving_session(
-    blocks: Blocks, bus: Connection, clock: Callable[[], Ns], *, enable: bool
+    blocks: Blocks, bus: Connection, clock: Callable[[], Ns], *, enable: bool, torque: float = 1.0
 ) -> tuple[Master, Session]:
-    """The controller side on a bus, behind the safety envelope."""
+    """The controller side on a bus, behind an envelope that lets out a share ``torque`` of the peak torques."""
     loop = bus_loop(blocks.settings)
     source, estimator = _speed(blocks, loop)
     plan = plan_for(blocks, loop, enable=enable)
@@ -88,7 +88,7 @@ def driving_session(
         check_bus(plan, loop.bit_rate, loop.traffic)
     master = Master(bus, clock, plan)
     control = blocks.control(estimator)
-    guard = Envelope(plan.joints)
+    guard = Envelope(plan.joints, torque=torque)
     following = _following(blocks)
     return master, Session(master, control, with_speed=source is not None, guard=guard, following=following)
 

@@ -79,7 +79,7 @@ _RAMPED = frozenset({5, 8})
 # States in which the motor may have current.
 ENERGISED = frozenset({State.OPERATION_ENABLED, State.QUICK_STOP, State.FAULT_REACTION})
 
-# Statusword bits beside the state (CiA 402-2); 8, 14 and 15 are the maker's: see lwa4d-facts 6.1.
+# Statusword bits beside the state (CiA 402-2); 8, 14 and 15 are the maker's: see libPowerballArm, ipa_canopen_core.
 VOLTAGE, WARNING, MOVING, REMOTE = 1 << 4, 1 << 7, 1 << 8, 1 << 9
 REACHED, LIMITED, SPECIFIC, DEVIATION = 1 << 10, 1 << 11, 1 << 12, 1 << 13
 BLOCKED, REFERENCED = 1 << 14, 1 << 15

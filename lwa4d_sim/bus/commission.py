@@ -16,18 +16,23 @@ START = 0x01  # NMT command
 SHUTDOWN, FAULT_RESET = 0x06, 0x80  # CiA 402 controlwords
 READY, SWITCHED_ON = 0x21, 0x23  # statuswords under the mask
 SYNCHRONOUS, EVENT = 1, 255  # PDO transmission types
+SEARCHED = 0x01  # bit of 2050: commutation search completed (Schunk_0_63.dcf)
 ANOTHER = Ns(5_000_000)  # [ns] in which a second device with an id would have answered too (assumed)
-# A drive misses its set-points as it misses SYNC: after six periods (200E of the LWA4D, lwa4d-facts 6.4).
+# A drive misses its set-points as it misses SYNC: after six periods (200E of the LWA4D, Schunk_0_63.dcf).
 TIME_OUT = 6
+Kept = tuple[int, Key, bytes]  # node, object, value
 ABSENT = (0x06020000, 0x06090011)  # SDO aborts: no such object, no such sub-index
 
 
-def commission(master: Master, parameters: Sequence[tuple[Key, str, float]] = ()) -> None:
+def commission(master: Master, parameters: Sequence[tuple[Key, str, float]] = ()) -> list[Kept]:
     """Find, check and set up every drive; ends with all of them operational and switched on, brakes closed.
 
     Args:
         master: fresh.
         parameters: further objects to write to each drive: (index, sub), `struct` format, value.
+
+    Returns:
+        What these objects held before, for `put_back`.
 
     Raises:
         BusError: a drive does not answer, is not what it should be, refuses, or does not switch on.
@@ -36,6 +41,11 @@ def commission(master: Master, parameters: Sequence[tuple[Key, str, float]] = ()
         master.frame(NMT, bytes([PRE_OPERATIONAL, station.node]))
     for station in master.stations:
         _identify(master, station)
+    kept = [
+        (station.node, key, master.client.read(station.node, *key))
+        for station in master.stations
+        for key, *_ in parameters
+    ]
     for station in master.stations:
         _set_up(master, station, parameters)
     for station in master.stations:
@@ -51,6 +61,17 @@ def commission(master: Master, parameters: Sequence[tuple[Key, str, float]] = ()
     for station in master.stations:
         _time_out(master, station)
     master.watch.enabled = False
+    return kept
+
+
+def put_back(master: Master, kept: Sequence[Kept]) -> None:
+    """Give the drives' own parameters back, after the arm has stopped: a drive without gains could not stop by itself.
+
+    Raises:
+        BusError: a drive does not answer or refuses.
+    """
+    for node, key, data in kept:
+        master.client.write(node, *key, data)
 
 
 def _identify(master: Master, station: Station) -> None:
@@ -71,6 +92,8 @@ def _identify(master: Master, station: Station) -> None:
             f"node {node}: does not support mode {master.layout.mode} of the profile '{master.plan.profile}'; "
             f"its modes (0x6502) are 0x{modes:X}"
         )
+    if master.plan.profile == "lwa4d" and not master.client.read(node, 0x2050)[0] & SEARCHED:
+        raise BusError(f"node {node}: must search its commutation first (0x2050 bit 0); see docs/commissioning.md")
 
 
 def _set_up(master: Master, station: Station, parameters: Sequence[tuple[Key, str, float]]) -> None:

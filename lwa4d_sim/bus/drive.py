@@ -1,7 +1,7 @@
 """One CiA 402 drive behind its node: loops, supervision, faults and what the bus may ask of it.
 
 Two profiles answer to the same program. With the objects of CiA 402 the option codes say how to stop; the firmware has
-none, and there every stop is the quick stop ramp and then the brake (lwa4d-facts, sections 4.2 and 6).
+none, and there every stop is the quick stop ramp and then the brake (Schunk_0_63.dcf).
 """
 
 import math
@@ -256,7 +256,7 @@ class Drive:
         """A fault: its reaction and, once, its emergency. Whether it is new and so changes anything.
 
         Args:
-            code: emergency code, as in lwa4d-facts 6.6.
+            code: emergency code, as in libPowerballArm, schunkErrors.h.
             report: send the emergency; False if the node does it.
         """
         if code in self._faults.active:

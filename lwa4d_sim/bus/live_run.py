@@ -9,7 +9,7 @@ import numpy as np
 
 from lwa4d_sim.assembly import Blocks
 from lwa4d_sim.bus.build import bus_loop, driving_session
-from lwa4d_sim.bus.commission import commission
+from lwa4d_sim.bus.commission import Kept, commission, put_back
 from lwa4d_sim.bus.connect import Connection
 from lwa4d_sim.bus.master import Master
 from lwa4d_sim.bus.options import Profile
@@ -39,6 +39,7 @@ class LiveRun:
         self._blocks, self._master, self._session = blocks, master, session
         self._cycles: list[Cycle] = []
         self._start = Ns(0)
+        self._kept: list[Kept] = []
 
     def set_up(self, profile: Profile) -> None:
         """Commission the drives; if that fails they are left with closed brakes.
@@ -47,7 +48,7 @@ class LiveRun:
             BusError: they are not there or refuse.
         """
         try:
-            commission(self._master, opening(profile))
+            self._kept = commission(self._master, opening(profile))
         except BaseException:
             with suppress(BusError):
                 self._master.let_go()
@@ -74,6 +75,7 @@ class LiveRun:
         finally:
             try:
                 self._master.stop()
+                put_back(self._master, self._kept)
             except BusError as error:
                 ended = f"{ended}; {error}" if ended != "done" else str(error)
         return ended
@@ -124,7 +126,13 @@ class LiveRun:
 
 
 def drive_arm(
-    blocks: Blocks, bus: Connection, stopped: Callable[[], object], *, seconds: float | None, realtime: bool
+    blocks: Blocks,
+    bus: Connection,
+    stopped: Callable[[], object],
+    *,
+    seconds: float | None,
+    realtime: bool,
+    torque: float = 1.0,
 ) -> tuple[LiveRun, dict[str, Any]]:
     """Drive an arm over a bus; the run and its summary, with how it ended.
 
@@ -134,13 +142,14 @@ def drive_arm(
         stopped: asked in every cycle whether to end.
         seconds: longest duration [s]; default that of the motion.
         realtime: ahead of all ordinary processes.
+        torque: share of each joint's peak torque that may be asked.
 
     Raises:
         BusError: no real-time scheduling here, or the drives cannot be set up.
     """
     loop = bus_loop(blocks.settings)
     ticks = blocks.timing.ticks if seconds is None else min(blocks.timing.ticks, math.ceil(seconds / loop.period))
-    master, session = driving_session(blocks, bus, monotonic, enable=True)
+    master, session = driving_session(blocks, bus, monotonic, enable=True, torque=torque)
     live = LiveRun(blocks, master, session)
     # begun before the set-up, since what it does takes longer than the drives wait for a heartbeat
     with undisturbed(CONTROLLER if realtime else None):

@@ -7,7 +7,7 @@ from lwa4d_sim.bus.motion import Point, line, move_to, stop
 from lwa4d_sim.interfaces import NS_PER_S, Ns
 
 START, AT_ONCE, RELATIVE = 1 << 4, 1 << 5, 1 << 6  # controlword, profile position
-PROCESS_DATA = 0x8900  # emergency: process data monitoring (CiA 402-2; in the firmware's list, lwa4d-facts 6.6)
+PROCESS_DATA = 0x8900  # emergency: process data monitoring (CiA 402-2; libPowerballArm, schunkErrors.h)
 
 
 class ProfilePosition(Mode):

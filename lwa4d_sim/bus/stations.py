@@ -13,7 +13,7 @@ CONTROL, STATUS, TORQUE_NOW, POSITION, SPEED = (0x6040, 0), (0x6041, 0), (0x6077
 TARGET_TORQUE, TARGET_POSITION, TARGET_SPEED = (0x6071, 0), (0x607A, 0), (0x60FF, 0)
 OFFSET, SET_POINT, PROFILE_SPEED = (0x60B2, 0), (0x60C1, 1), (0x6081, 0)
 
-MDEG_PER_RAD = 57295.779513082323  # 360,000 millidegrees a turn (schunk_canopen_driver, SchunkPowerBallNode)
+MDEG_PER_RAD = 57295.779513082323  # 360,000 millidegrees a turn (schunk_canopen_driver)
 
 NEVER = Ns(-(2**62))  # the stamp of what has not come yet; virtual time may begin below zero
 

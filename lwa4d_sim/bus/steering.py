@@ -48,7 +48,7 @@ class Why(Enum):
 _RAMPS = {5: Why.DISABLE, 8: Why.SHUTDOWN}
 _COAST = 0  # option code: no ramp
 _SLOW_DOWN = 1  # option code, for a change of mode (assumed)
-_FIXED = 2  # option code of the firmware, which has no objects for them: quick stop ramp (lwa4d-facts 4.2)
+_FIXED = 2  # option code of the firmware, which has no objects for them: quick stop ramp (Schunk_0_63.dcf)
 
 
 class Steering:
@@ -118,7 +118,7 @@ class Steering:
         self._axis.dictionary[0x2050, 0] = VERIFIED | (SEARCHED if done else 0)
 
     def sync(self, now: Ns) -> None:
-        """SYNC: in mode 7 it carries the commutation search on (lwa4d-facts 6.2); the axis does not visibly move."""
+        """SYNC: in mode 7 it carries the commutation search on (schunk_canopen_driver); the axis stands."""
         if not self.searched and self.why is Why.RUN and self.mode.number == 7:
             self._syncs += 1
             if self._syncs >= SEARCH_SYNCS:

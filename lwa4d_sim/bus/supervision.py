@@ -48,7 +48,7 @@ class Supervision:
         return ended
 
     def sync_deadline(self) -> Ns | None:
-        """When the next SYNC must have come: 200E times 60C2 after the last (lwa4d-facts 6.4); 200E = 0 is off.
+        """When the next SYNC must have come: 200E times 60C2 after the last (Schunk_0_63.dcf); 200E = 0 is off.
 
         ASSUMED: a drive that has never seen a SYNC is not run by one, and does not miss it.
         """

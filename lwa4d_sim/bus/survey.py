@@ -25,7 +25,7 @@ NODES = range(1, 128)
 READ_DEVICE_TYPE = bytes((0x40, 0x00, 0x10, 0, 0, 0, 0, 0))  # SDO: initiate upload of 1000
 PACE = 0.002  # [s] between the requests of the scan: a controller's queue may be ten frames short (socketcan's default)
 PATIENCE = 0.3  # [s] for the last answer, as the SDO client waits
-RPDOS, TPDOS = range(0x1400, 0x1404), range(0x1800, 0x1804)  # the drives have no more (lwa4d-facts 4.1)
+RPDOS, TPDOS = range(0x1400, 0x1404), range(0x1800, 0x1804)  # the drives have no more (Schunk_0_63.dcf)
 FIRST_OBJECT = 0x1000
 HISTORY = 8  # errors of 1003 that are read
 
