@@ -8,7 +8,8 @@ LwaError
 │   ├── SingularError             the target leaves a joint angle undefined
 │   └── JointLimitError           every branch of the inverse breaks a joint limit
 ├── TrajectoryError (ValueError)  a motion that cannot be built from what was asked
-└── RecordError (OSError)         a record cannot be written or read
+├── RecordError (OSError)         a record cannot be written or read
+└── BusError (OSError)            a bus, a node on it, or what it said, is not as it must be
 """
 
 

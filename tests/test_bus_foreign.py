@@ -586,7 +586,7 @@ def test_a_foreign_slave_that_is_no_such_drive_is_refused(bench: Callable[..., B
         commission(bench(device=0x191).master)
     with pytest.raises(BusError, match=r"node 3: does not support mode 10 of the profile 'cia402'; .* are 0x1"):
         commission(bench(modes=1).master)
-    with pytest.raises(BusError, match=r"node 3: cannot write object 0x2030:00: .*\(SDO abort 0x06020000\)"):
+    with pytest.raises(BusError, match=r"node 3: cannot read object 0x2030:00: .*\(SDO abort 0x06020000\)"):
         commission(bench().master, opening("lwa4d"))
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -158,6 +159,11 @@ def test_the_record_keeps_the_frames(tmp_path: Path) -> None:
     for name, (column, unit) in log.frames.columns().items():
         np.testing.assert_array_equal(again.columns()[name][0], column)
         assert again.columns()[name][1] == unit
+    page = (Path(__file__).parent.parent / "docs" / "record.md").read_text(encoding="utf-8")
+    told = re.findall(r"^\| `/frames/(\w+)` \| F( x 8)? \| ([\w-]+) \|", page, re.MULTILINE)
+    assert {name: (wide, unit) for name, wide, unit in told} == {
+        name: (" x 8" if name == "data" else "", unit or "-") for name, (_, unit) in again.columns().items()
+    }
     # what a drive says is where the arm is: TPDO 1 carries statusword, torque and position
     here = (again.id == 0x183) & (again.queued >= 0)
     position = again.data[here][:, 4:8].copy().view("<i4")[:, 0] * MILLIDEGREE
