@@ -371,6 +371,47 @@ def test_check_beside_a_data_sheet(call: Call, served: Serve) -> None:
     assert not {"6064", "1000", "6040"} & set(found["text"].split())
 
 
+def one_step_a_sync(spacing: int, silence: int) -> list[int]:
+    """Positions [mdeg] after each SYNC of a move of joint 1, SYNCs so many milliseconds apart after a silence."""
+    bus: Any = type("", (), {"send": lambda self, msg: None})()
+    arm = served_arm(blocks_of(), bus, epoch=Ns(0), per_sync=True)
+    now = Ns(0)
+    arm.power_on(now)
+
+    def put(cob_id: int, *data: int) -> None:
+        arm.receive(can.Message(arbitration_id=cob_id, data=bytes(data), is_extended_id=False), now)
+
+    def run(count: int) -> None:
+        nonlocal now
+        for _ in range(count * spacing):
+            now = Ns(now + MS)
+            arm.poll(now)
+            arm.catch_up(now)
+            if now % (spacing * MS) == 0:
+                put(0x080)
+                seen.append(arm.nodes[0].dictionary[0x6064, 0])
+
+    seen: list[int] = []
+    now = Ns(silence * spacing * MS)
+    put(0x000, 0x01, 0)
+    put(0x603, 0x2F, 0x60, 0x60, 0, 1, 0, 0, 0)
+    for word in (0x06, 0x07, 0x0F):
+        put(0x603, 0x2B, 0x40, 0x60, 0, word, 0, 0, 0)
+        run(2)
+    put(0x603, 0x23, 0x7A, 0x60, 0, *(seen[0] + 3000).to_bytes(4, "little", signed=True))
+    put(0x603, 0x2B, 0x40, 0x60, 0, 0x1F, 0, 0, 0)
+    run(50)
+    return seen
+
+
+def test_an_arm_of_one_step_a_sync_knows_no_other_time(call: Call) -> None:
+    """The motion is a function of the number of SYNCs alone, whatever the clock of the bus says."""
+    expected = one_step_a_sync(10, 0)
+    assert abs(expected[-1] - expected[0] - 3000) < 100
+    assert one_step_a_sync(25, 0) == expected
+    assert one_step_a_sync(3, 5000) == expected
+
+
 # ---- in virtual time, against what was put on the wire ----
 
 

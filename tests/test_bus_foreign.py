@@ -142,7 +142,9 @@ class Foreign:
         return int(self.nodes[node].sdo[0x6064].raw)
 
     def close(self) -> None:
-        self.network.sync.stop()
+        self.network.sync.stop()  # which the drives notice, and stop
+        for node in self.nodes.values():
+            until(lambda: node.sdo[0x6041].raw & 0x6F not in (0x27, 0x07), "a drive goes on without SYNC")  # noqa: B023
         self.network.disconnect()
 
 
@@ -167,7 +169,7 @@ def in_a_thread(scenario: Path) -> Iterator[dict[str, Any]]:
     bus = connect(options["interface"], options["channel"])
     arm = served_arm(blocks_of(scenario), bus, epoch=monotonic(), per_sync=False)
     over = threading.Event()
-    thread = threading.Thread(target=serve, args=(arm, bus, monotonic, over.is_set))
+    thread = threading.Thread(target=serve, args=(arm, bus, monotonic, over.is_set), daemon=True)
     thread.start()
     yield options
     over.set()

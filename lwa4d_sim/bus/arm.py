@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import can
 import numpy as np
 
+from lwa4d_sim.bus.device import Loss
 from lwa4d_sim.bus.dictionary import Joint, drive_dictionary
 from lwa4d_sim.bus.drive import Drive
 from lwa4d_sim.bus.node import NmtState, Node
@@ -89,7 +90,8 @@ class BusArm:
             # the drive reports through its node, which is made right after it
             emergency = _Emergency()
             drive = Drive(dictionary, joint, emergency.raised, emergency.recovered, self.catch_up)
-            node = Node(joint.node, dictionary, sender(joint.node), drive)
+            device = drive if per_sync is None else _InPlantTime(drive, self)
+            node = Node(joint.node, dictionary, sender(joint.node), device)
             emergency.node = node
             self.drives.append(drive)
             self.nodes.append(node)
@@ -181,8 +183,13 @@ class BusArm:
         """Drop the motion recorded since the last `collect`."""
         self._pieces.clear()
 
+    @property
+    def plant_time(self) -> Ns:
+        """The instant up to which the plant has been stepped."""
+        return Ns(self._epoch + self._step * self._dt)
+
     def _move(self, steps: int) -> None:
-        now = Ns(self._epoch + self._step * self._dt)
+        now = self.plant_time
         seconds = self._dt / NS_PER_S
         tau = np.array([[[drive.torque(now, seconds) for drive in self.drives]]])
         braked = np.array([drive.braked for drive in self.drives])
@@ -219,6 +226,30 @@ class BusArm:
                 for each in node.data_ids if node.node_id not in self.deaf else ():
                     self._listeners.setdefault(each, []).append(k)
         return self._listeners.get(cob_id, ())
+
+
+class _InPlantTime:
+    """A drive whose plant moves on at each SYNC only: without SYNC no time passes for its ramps and watchdog."""
+
+    def __init__(self, drive: Drive, arm: BusArm) -> None:
+        self._drive, self._arm = drive, arm
+        self.refresh, self.written = drive.refresh, drive.written
+
+    def advance(self, now: Ns) -> None:
+        self._arm.catch_up(now)
+        self._drive.advance(self._arm.plant_time)
+
+    def sync(self, now: Ns) -> None:
+        self._drive.sync(self._arm.plant_time)
+
+    def lost(self, reason: Loss, now: Ns) -> None:
+        self._drive.lost(reason, self._arm.plant_time)
+
+    def reset(self, now: Ns) -> None:
+        self._drive.reset(self._arm.plant_time)
+
+    def poll(self, now: Ns) -> None:
+        self._drive.poll(self._arm.plant_time)  # the next SYNC polls again
 
 
 class _Emergency:
