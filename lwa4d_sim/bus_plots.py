@@ -1,5 +1,6 @@
 """Picture of a bus: one cycle as a time line, and every identifier's response times beside their worst case."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import matplotlib.style
@@ -8,9 +9,13 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from lwa4d_sim.bus_timing import BusTiming
+from lwa4d_sim.bus_timing import BusTiming, analyse
 from lwa4d_sim.drawing import GREY, LOOK, PALETTE, SMALL, WIDTH, Picture, save
 from lwa4d_sim.interfaces import NS_PER_S
+from lwa4d_sim.record import RunLog
+from lwa4d_sim.settings import CanopenLoop
+
+LEAST_CYCLES = 3  # a shorter run has no cycle that is like the next
 
 _KINDS = ("SYNC and NMT", "measurements (TPDO)", "set-points (RPDO)", "the rest")
 _COLOURS = (PALETTE[1], PALETTE[0], PALETTE[2], GREY)
@@ -42,7 +47,22 @@ def draw_timing(timing: BusTiming, title: str, period: float, path: Path) -> Pic
         )
         _time_line(line, timing, period)
         _responses(below, timing)
+        figure.legend(*line.get_legend_handles_labels(), ncols=4, fontsize=SMALL, loc="outside lower center")
         return save(figure, Picture(path, title, CAPTION))
+
+
+def draw_buses(logs: Mapping[str, RunLog], folder: Path) -> list[Picture]:
+    """Draw the bus of each run that was on one, as ``bus_VARIANT.png``."""
+    drawn = []
+    for name, log in logs.items():
+        bit_rate = log.scenario.get("loop", {}).get("bit_rate", CanopenLoop().bit_rate)
+        cycles = (len(log.q) - 1) * log.timestep // log.period
+        if log.frames is None or bit_rate is None or cycles < LEAST_CYCLES:
+            continue
+        found = analyse(log.frames, bit_rate, log.period, cycles)
+        title = f"The bus of {name}: one cycle at {bit_rate // 1000} kbit/s"
+        drawn.append(draw_timing(found, title, log.period / NS_PER_S, folder / f"bus_{name}.png"))
+    return drawn
 
 
 def _kind(can_id: int) -> int:
@@ -81,7 +101,6 @@ def _time_line(ax: Axes, timing: BusTiming, period: float) -> None:
     ax.set_xlim(0, period * 1e3)
     ax.set_xlabel("time in the cycle [ms]")
     ax.set_title(f"bus load {100 * timing.load:.0f} %", fontsize=SMALL, loc="right")
-    ax.legend(ncols=4, fontsize=SMALL, loc="upper center", bbox_to_anchor=(0.5, -0.16))
 
 
 def _responses(ax: Axes, timing: BusTiming) -> None:

@@ -135,8 +135,16 @@ def section_from_folder(folder: Path) -> Section:
         source=_entry(summary, "source", str, path),
         overrides=_entry(summary, "overrides", dict, path),
         versions=_entry(summary, "versions", dict, path),
-        figures=pictures(folder) or draw_all(logs, folder),
+        figures=pictures(folder) or [*draw_all(logs, folder), *_buses(logs, folder)],
     )
+
+
+def _buses(logs: Mapping[str, RunLog], folder: Path) -> list[Picture]:
+    if all(log.frames is None for log in logs.values()):
+        return []
+    from lwa4d_sim.bus_plots import draw_buses  # and with it python-can
+
+    return draw_buses(logs, folder)
 
 
 def _entry(data: Any, key: str, kind: type[_T], where: Any) -> _T:

@@ -11,6 +11,7 @@ import pytest
 
 from lwa4d_sim.arm import ARMS, MODULES
 from lwa4d_sim.bus.joints import TORQUE_CONSTANT
+from lwa4d_sim.bus_plots import draw_buses
 from lwa4d_sim.errors import ScenarioError
 from lwa4d_sim.record import RunLog
 from lwa4d_sim.runner import run
@@ -146,6 +147,15 @@ def test_a_bus_too_slow_for_its_cycle_is_refused() -> None:
     """At 100 kbit/s the cycle of seven joints needs more than 30 ms."""
     with pytest.raises(ScenarioError, match=r"375 % of the bus .* at least 375000 bit/s"):
         both("lwa4d_7dof", "cia402", COMPUTED_TORQUE, "next_sync", bit_rate=100_000)
+
+
+def test_a_run_over_the_bus_gets_a_picture_of_it(tmp_path: Path) -> None:
+    sampled, canopen = both("lwa4d_3dof", "lwa4d", PD, "next_sync")
+    _, costless = both("lwa4d_3dof", "lwa4d", PD, "immediate", bit_rate=None)
+    made = draw_buses({"sampled": sampled, "canopen": canopen, "costless": costless}, tmp_path)
+    assert [picture.path.name for picture in made] == ["bus_canopen.png"]
+    assert made[0].path.stat().st_size > 20_000
+    assert "500 kbit/s" in made[0].title
 
 
 def test_the_record_keeps_the_frames(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from lwa4d_sim.bus.mapping import Key
 from lwa4d_sim.bus.objects import EXTENSION, EXTENSION_PDOS, FIRMWARE, FIRMWARE_PDOS, pdo_rows
 from lwa4d_sim.bus.options import FIRST_NODE
 
-__all__ = ["Abort", "Dictionary", "Entry", "GROUPS", "Group", "Joint", "drive_dictionary"]
+__all__ = ["Abort", "Dictionary", "Entry", "Group", "Joint", "drive_dictionary"]
 
 Group = Literal["all", "communication", "manufacturer", "application"]
 
