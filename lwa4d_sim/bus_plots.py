@@ -15,6 +15,7 @@ from lwa4d_sim.interfaces import NS_PER_S
 from lwa4d_sim.record import RunLog
 from lwa4d_sim.settings import CanopenLoop
 
+BINS = 150  # of each identifier's histogram
 LEAST_CYCLES = 3  # a shorter run has no cycle that is like the next
 
 _KINDS = ("SYNC and NMT", "measurements (TPDO)", "set-points (RPDO)", "the rest")
@@ -22,9 +23,9 @@ _COLOURS = (PALETTE[1], PALETTE[0], PALETTE[2], GREY)
 
 CAPTION = (
     "Above: one cycle on the wire, a bar for each frame from its first to its last bit, one line a station. "
-    "Below: for each identifier, the most urgent on top, how long its frames took from queued to received (dots) and "
-    "the worst that can happen by analysis (bar's end). A dot beyond its bar would be an error; an identifier without "
-    "a bar has no bound: the bus is overloaded for it."
+    "Below: for each identifier, the most urgent on top, a histogram of how long its frames took from queued to "
+    "received, and in grey the worst that can happen by analysis. A frame beyond the grey would be an error; an "
+    "identifier without grey has no bound: the bus is overloaded for it."
 )
 
 
@@ -104,13 +105,20 @@ def _time_line(ax: Axes, timing: BusTiming, period: float) -> None:
 
 
 def _responses(ax: Axes, timing: BusTiming) -> None:
+    finite = [1e3 * response.bound for response in timing.responses if np.isfinite(response.bound)]
+    right = 1.02 * max([*finite, *(1e3 * float(response.seen.max()) for response in timing.responses)])
+    edges = np.linspace(0.0, right, BINS + 1)
     for k, response in enumerate(timing.responses):
         if np.isfinite(response.bound):
-            ax.barh(k, response.bound * 1e3, height=0.7, color="#dddddd")
+            ax.barh(k, response.bound * 1e3, height=0.8, color="#e4e4e4")
+        counts, _ = np.histogram(response.seen * 1e3, edges)
+        some = counts > 0
+        # the axis points down; even a single frame is seen
+        height = -(0.15 + 0.65 * counts[some] / counts.max())
         colour = _COLOURS[_kind(response.id)]
-        seen = np.unique(np.round(response.seen * 1e3, 3))
-        ax.plot(seen, np.full(len(seen), k), ".", ms=3, color=colour)
+        ax.bar(edges[:-1][some], height, right / BINS, bottom=k + 0.4, align="edge", color=colour)
     ax.set_yticks(range(len(timing.responses)), [f"{r.name}" for r in timing.responses], fontsize=SMALL - 3)
-    ax.invert_yaxis()
-    ax.set_xlim(left=0)
+    ax.set_ylim(len(timing.responses) - 0.4, -0.6)
+    ax.set_xlim(0, right)
+    ax.grid(axis="y", visible=False)
     ax.set_xlabel("from queued to received [ms]; grey: worst case by analysis")
