@@ -65,7 +65,7 @@ def timing(
     found = analyse(FrameLog.of(simulation.wire.frames), loop.bit_rate, blocks.timing.period, total)
     if log is not None:
         write(found.log, log)
-    folder = out / f"{blocks.scenario.name}"
+    folder = out / blocks.scenario.name
     folder.mkdir(parents=True, exist_ok=True)
     title = f"{blocks.scenario.name}, {blocks.variant}: one cycle at {loop.bit_rate // 1000} kbit/s"
     picture = draw_timing(found, title, loop.period, folder / "bus_timing.png")
@@ -149,6 +149,8 @@ def drive(
     from lwa4d_sim.bus.live_run import drive_arm, report
     from lwa4d_sim.bus.process import stoppable
 
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)  # before the arm moves, so that no record is lost
     bus = connect(interface, channel, bus_loop(blocks.settings).bit_rate)
     try:
         log_to(bus, log)
@@ -158,7 +160,6 @@ def drive(
         bus.shutdown()
     print(json.dumps(found) if as_json else report(found))
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
         live.record().save(out / f"{blocks.scenario.name}_bus.h5")
     raise typer.Exit(0 if found["ended"] == "done" else 2)
 
@@ -201,7 +202,7 @@ def check(
     bit_rate: Annotated[
         int | None, typer.Option(metavar="BIT/S", min=1, help="Of the bus; default the scenario's, else 500000.")
     ] = None,
-    seconds: Annotated[float, typer.Option(metavar="S", min=0.0, help="Listen so long before asking.")] = 1.0,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.0, max=3600.0, help="Listen so long first.")] = 1.0,
     sheet: Annotated[
         Path | None, typer.Option("--eds", metavar="SHEET", help="Name the objects of this sheet that a node lacks.")
     ] = None,
@@ -220,8 +221,12 @@ def check(
     from lwa4d_sim.bus_tables import print_survey
     from lwa4d_sim.settings import CanopenLoop
 
-    blocks = None if file is None else _blocks(file, variant, overrides)
-    loop = CanopenLoop() if blocks is None else bus_loop(blocks.settings)
+    loop, plan = CanopenLoop(), None
+    if file is not None:
+        blocks = _blocks(file, variant, overrides)
+        loop = bus_loop(blocks.settings)
+        with blocks.about("loop"):
+            plan = plan_for(blocks, loop)
     rate = bit_rate or loop.bit_rate
     objects = None if sheet is None else load(sheet)
     bus = connect(interface, channel, rate)
@@ -232,7 +237,7 @@ def check(
             said = [] if objects is None else beside_sheet(surveyor, found, objects)
     finally:
         bus.shutdown()
-    said += [] if blocks is None else differences(found, plan_for(blocks, loop), rate)
+    said += [] if plan is None else differences(found, plan, rate)
     if as_json:
         print(json.dumps({**asdict(found), "differences": list(map(asdict, said))}))
     else:

@@ -24,8 +24,9 @@ _COLOURS = (PALETTE[1], PALETTE[0], PALETTE[2], GREY)
 CAPTION = (
     "Above: one cycle on the wire, a bar for each frame from its first to its last bit, one line a station. "
     "Below: for each identifier, the most urgent on top, a histogram of how long its frames took from queued to "
-    "received, and in grey the worst that can happen by analysis. A frame beyond the grey would be an error; an "
-    "identifier without grey has no bound: the bus is overloaded for it."
+    "received, and in grey the worst that can happen by analysis. The analysis knows no bit errors: only on a wire "
+    "that has some may a frame go beyond the grey. An identifier without grey has no bound: the bus is overloaded for "
+    "it."
 )
 
 
@@ -78,10 +79,10 @@ def _time_line(ax: Axes, timing: BusTiming, period: float) -> None:
     log = timing.log
     rows = timing.cycle
     first = (log.started[rows] - timing.start) / NS_PER_S * 1e3
-    last = (log.received[rows] - timing.start) / NS_PER_S * 1e3
+    last = (timing.end - timing.start) / NS_PER_S * 1e3
     kinds = np.array([_kind(int(i)) for i in log.id[rows]])
     lanes = [log.names[n] for n in log.node[rows]]
-    names = sorted(set(lanes), key=lambda lane: (lane != "master", lane))
+    names = sorted(set(lanes), key=lambda lane: (lane != "master", len(lane), lane))  # node 9 before node 10
     place = {name: k for k, name in enumerate(names)}
     y = np.array([place[lane] for lane in lanes])
     for kind, (label, colour) in enumerate(zip(_KINDS, _COLOURS, strict=True)):
@@ -106,7 +107,7 @@ def _time_line(ax: Axes, timing: BusTiming, period: float) -> None:
 
 def _responses(ax: Axes, timing: BusTiming) -> None:
     finite = [1e3 * response.bound for response in timing.responses if np.isfinite(response.bound)]
-    right = 1.02 * max([*finite, *(1e3 * float(response.seen.max()) for response in timing.responses)])
+    right = 1.02 * max([*finite, *(1e3 * float(response.seen.max()) for response in timing.responses)], default=1.0)
     edges = np.linspace(0.0, right, BINS + 1)
     for k, response in enumerate(timing.responses):
         if np.isfinite(response.bound):

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from lwa4d_sim.bus.response import Stream, response_times
-from lwa4d_sim.frame_log import FrameLog
+from lwa4d_sim.frame_log import OUTCOMES, FrameLog
 from lwa4d_sim.interfaces import NS_PER_S, Array, IntArray, Ns
 
 
@@ -18,7 +18,7 @@ class Responses:
         id: CAN identifier.
         name: what the predefined connection set calls it.
         seen: observed times [s] (frames,).
-        bound: worst case [s] (Davis, Burns, Bril and Lukkien 2007); inf when there is none.
+        bound: worst case [s] on a bus without errors (Davis, Burns, Bril and Lukkien 2007); inf when there is none.
     """
 
     id: int
@@ -33,6 +33,7 @@ class BusTiming:
 
     Attributes:
         cycle: rows of the frames of one cycle in the log.
+        end: of each of these frames [ns]; of one that failed, when the wire is free again.
         start: beginning of that cycle [ns].
         load: share of the time at which the wire was busy.
         responses: one for each identifier, most urgent first.
@@ -40,6 +41,7 @@ class BusTiming:
 
     log: FrameLog
     cycle: IntArray
+    end: IntArray
     start: Ns
     load: float
     responses: list[Responses]
@@ -68,7 +70,8 @@ def analyse(log: FrameLog, bit_rate: int, period: Ns, cycles: int) -> BusTiming:
     """
     end = cycles * period
     inside = (log.queued >= 0) & (log.started < end)
-    load = float(log.bits[inside].sum()) / bit_rate / (end / NS_PER_S)
+    free = _free(log, bit_rate)
+    load = float((free - log.started)[inside].sum()) / end
     received = inside & (log.received >= 0) & (log.outcome == 0)
     streams, seen = [], []
     for can_id in np.unique(log.id[received & ~log.extended]).tolist():
@@ -86,7 +89,20 @@ def analyse(log: FrameLog, bit_rate: int, period: Ns, cycles: int) -> BusTiming:
     k = max(0, cycles - 2)
     cycle = np.flatnonzero((log.started >= k * period) & (log.started < (k + 1) * period))
     responses = [Responses(can_id, name_of(can_id), times, bounds[can_id] / NS_PER_S) for can_id, times in seen]
-    return BusTiming(log, cycle, Ns(k * period), load, responses)
+    ends = np.where(log.outcome == 0, log.received, free)[cycle]
+    return BusTiming(log, cycle, ends, Ns(k * period), load, responses)
+
+
+def _free(log: FrameLog, bit_rate: int) -> IntArray:
+    """When the wire is free after each transmission [ns].
+
+    A spoilt frame is not sent to its end: behind its error frame comes a repetition.
+    """
+    free = log.started.copy()  # what was given up was not on the wire
+    rows = np.flatnonzero(log.outcome != OUTCOMES.index("discarded"))
+    whole = log.started[rows] + log.bits[rows] * NS_PER_S // bit_rate
+    free[rows] = np.minimum(whole, np.append(log.started[rows][1:], whole[-1:]))
+    return free
 
 
 def as_object(timing: BusTiming) -> dict[str, Any]:
@@ -97,9 +113,10 @@ def as_object(timing: BusTiming) -> dict[str, Any]:
             "id": int(log.id[k]),
             "bits": int(log.bits[k]),
             "start": (int(log.started[k]) - timing.start) / NS_PER_S,
-            "end": (int(log.received[k]) - timing.start) / NS_PER_S,
+            "end": (int(end) - timing.start) / NS_PER_S,
+            "outcome": OUTCOMES[log.outcome[k]],
         }
-        for k in timing.cycle
+        for k, end in zip(timing.cycle, timing.end, strict=True)
     ]
     response = {
         str(r.id): {"max": float(r.seen.max()), "bound": r.bound if np.isfinite(r.bound) else None}
@@ -112,10 +129,11 @@ def as_text(timing: BusTiming) -> str:
     """For a terminal."""
     log = timing.log
     lines = [f"{'frame':16} {'bits':>5} {'start [ms]':>11} {'end [ms]':>9}"]
-    for k in timing.cycle:
-        start, end = ((int(t) - timing.start) / 1e6 for t in (log.started[k], log.received[k]))
+    for k, until in zip(timing.cycle, timing.end, strict=True):
+        start, end = ((int(t) - timing.start) / 1e6 for t in (log.started[k], until))
         name = f"{int(log.id[k]):03X} {name_of(int(log.id[k]))}"
-        lines.append(f"{name:16} {int(log.bits[k]):5} {start:11.3f} {end:9.3f}")
+        failed = f"  {OUTCOMES[log.outcome[k]]}" if log.outcome[k] else ""
+        lines.append(f"{name:16} {int(log.bits[k]):5} {start:11.3f} {end:9.3f}{failed}")
     lines += ["", f"{'identifier':16} {'frames':>7} {'longest [ms]':>13} {'worst case [ms]':>16}"]
     for r in timing.responses:
         bound = f"{r.bound * 1e3:.3f}" if np.isfinite(r.bound) else "none"

@@ -19,7 +19,7 @@ _UNITS |= {"node": "", "queued": "ns", "started": "ns", "received": "ns"}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameLog:
-    """F transmissions in the order of their start.
+    """F transmissions in the order of their end.
 
     Attributes:
         id: CAN identifier (F,).
@@ -88,5 +88,17 @@ class FrameLog:
 
     @staticmethod
     def read(group: Any) -> "FrameLog":
-        """From the HDF5 group that holds `columns` and the attribute ``names``."""
-        return FrameLog(**{key: group[key][:] for key in _UNITS}, names=tuple(group.attrs["names"].split("\n")))
+        """From the HDF5 group that holds `columns` and the attribute ``names``.
+
+        Raises:
+            ValueError: the columns do not fit each other, or hold what no frame can have.
+        """
+        log = FrameLog(**{key: group[key][:] for key in _UNITS}, names=tuple(group.attrs["names"].split("\n")))
+        for key in _UNITS:
+            column, kinds = getattr(log, key), "b" if key in ("extended", "remote") else "iu"
+            if column.shape != ((len(log), 8) if key == "data" else (len(log),)) or column.dtype.kind not in kinds:
+                raise ValueError(f"frames/{key} does not fit the other columns")
+        for key, end in (("size", 9), ("outcome", len(OUTCOMES)), ("node", len(log.names))):
+            if ((getattr(log, key) < 0) | (getattr(log, key) >= end)).any():
+                raise ValueError(f"frames/{key} holds a number that is none of 0 to {end - 1}")
+        return log

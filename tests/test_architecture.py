@@ -30,9 +30,9 @@ ROWS = (
     "controllers.pd_gravity controllers.computed_torque controllers.custom",
     "trajectories references estimators channels drives plant controllers",
     # the bus: a CAN controller and its wire, a CANopen node, a CiA 402 drive, and the master
-    "bus bus.options bus.fault_options bus.frames bus.transmission bus.entry bus.objects bus.mapping bus.device "
+    "bus bus.options bus.frames bus.transmission bus.entry bus.objects bus.mapping bus.device "
     "bus.cia402 bus.motion bus.brake bus.client bus.process bus.candump",
-    "bus.confinement bus.response bus.sheet bus.sdo bus.alarms bus.connect",
+    "bus.confinement bus.response bus.sheet bus.sdo bus.alarms bus.connect bus.fault_options",
     "bus.dictionary",
     "bus.port bus.emergency bus.error_control bus.pdo_rules bus.sync bus.axis bus.joints bus.safety bus.stations",
     "bus.disturbances bus.access bus.pdo bus.gauges bus.mode bus.servo bus.supervision bus.tamper bus.watch",

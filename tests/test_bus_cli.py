@@ -6,6 +6,7 @@ import re
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -90,8 +91,11 @@ def blocks_of(**loop: Any) -> Any:
 
 
 @pytest.fixture
-def served(call: Call) -> Iterator[Serve]:
+def served(call: Call, monkeypatch: pytest.MonkeyPatch) -> Iterator[Serve]:
     """Serves the arm in a thread; what is changed about it beforehand is up to the test."""
+    # a busy machine may keep the thread from answering for longer than a bus would
+    monkeypatch.setattr("lwa4d_sim.bus.client.RESPONSE_TIMEOUT", 3.0)
+    monkeypatch.setattr("lwa4d_sim.bus.survey.PATIENCE", 1.0)
     over = threading.Event()
     threads: list[threading.Thread] = []
     buses: list[Any] = []
@@ -132,6 +136,8 @@ def test_an_interface_or_channel_that_is_none(call: Call, command: str) -> None:
     for interface, channel in [
         ("udp_multicast", "not an address"),
         ("udp_multicast", "239.1.1.1:70000"),
+        ("udp_multicast", "239.1.1.1:" + 5000 * "9"),
+        ("kvaser", "0"),
         ("socketcan", "x9"),
     ]:
         result = call(command, *arguments, "-i", interface, "-c", channel)
@@ -262,6 +268,24 @@ def test_a_folder_that_cannot_be_written(call: Call) -> None:
     refused(call("timing", "small.yaml", "-o", "file"), "file")
 
 
+def test_a_folder_for_the_record_is_made_before_the_arm_moves(call: Call, served: Serve) -> None:
+    there = served(profile="lwa4d")
+    Path("file").write_text("")
+    refused(call("drive", "small.yaml", "-i", "virtual", "-c", there.channel, "--arm", "-o", "file"), "file")
+    assert not [msg for msg in frames_on(there.bus) if msg.arbitration_id == 0x080]
+
+
+@pytest.mark.parametrize("command", [["serve"], ["drive", "--arm"], ["check"], ["eds", "-o", "sheets"]])
+def test_node_ids_that_do_not_fit_are_said_with_their_place(call: Call, command: list[str]) -> None:
+    bus = [] if command[0] == "eds" else ["-i", "virtual", "-c", f"{random.getrandbits(64)}"]
+    result = call(command[0], "small.yaml", *command[1:], *bus, "--set", "loop.nodes=[1, 1, 2]")
+    refused(result, r"small.yaml: loop.nodes .*must be 3 different node ids")
+
+
+def test_listening_for_ever_is_refused(call: Call) -> None:
+    refused(call("check", "-i", "virtual", "-c", "empty", "--seconds", "inf"), "less than or equal to 3600")
+
+
 # ---- what works ----
 
 
@@ -296,7 +320,8 @@ def test_timing_as_an_object(call: Call) -> None:
     pdos = [base + node for base in (0x180, 0x200, 0x280, 0x300) for node in (3, 4, 5)]
     assert sorted(ids) == sorted([0x080, *pdos])
     for frame in found["frames"]:
-        assert frame.keys() == {"id", "bits", "start", "end"}
+        assert frame.keys() == {"id", "bits", "start", "end", "outcome"}
+        assert frame["outcome"] == "sent"
         # received the three interframe bits before the bus is free again
         assert frame["end"] - frame["start"] == pytest.approx((frame["bits"] - 3) / 500_000, abs=1e-9)
         assert 0 <= frame["start"] < 0.01
@@ -305,6 +330,17 @@ def test_timing_as_an_object(call: Call) -> None:
     for response in found["response"].values():
         assert response.keys() == {"max", "bound"}
         assert 0 < response["max"] <= response["bound"]
+
+
+def test_timing_of_a_wire_with_errors(call: Call) -> None:
+    """Spoilt frames end when the wire is free again."""
+    noise = ("--set", "loop.noise.per_bit=2e-3", "--cycles", "8", "-o", "out")
+    frames = json.loads(call("timing", "small.yaml", *noise, "--json").out)["frames"]
+    assert {frame["outcome"] for frame in frames} == {"sent", "error"}
+    assert all(frame["start"] < frame["end"] for frame in frames)
+    assert all(one["end"] <= other["start"] + 1e-9 for one, other in pairwise(frames))
+    rows = call("timing", "small.yaml", *noise).out.split("\n\n")[0].splitlines()[1:]
+    assert [row.endswith("  error") for row in rows] == [frame["outcome"] == "error" for frame in frames]
 
 
 def test_sheets_that_the_library_reads(call: Call) -> None:

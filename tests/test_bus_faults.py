@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from lwa4d_sim.assembly import build_blocks
 from lwa4d_sim.bus.build import canopen_run
 from lwa4d_sim.bus.cia402 import State
-from lwa4d_sim.bus.commission import commission, interpolation_period
+from lwa4d_sim.bus.commission import commission, interpolation_period, put_back
 from lwa4d_sim.bus.dictionary import drive_dictionary
 from lwa4d_sim.bus.fault_options import Fault
 from lwa4d_sim.bus.node import NmtState
@@ -501,6 +501,16 @@ def test_a_drive_with_an_error_stops_and_so_do_the_others(profile: str) -> None:
     assert [played.state(node) for node in (3, 5)] == [OFF, OFF]
 
 
+def test_a_stop_begun_in_a_cycle_without_measurements_is_a_quick_stop() -> None:
+    lost = [fault("lost_pdo", node=node, pdo="tpdo1") for node in (3, 4, 5)]
+    simulation, ticks = canopen_run(build_blocks([scenario(*lost)], "default", 1))
+    for _ in range(round(AT / 0.01)):
+        next(ticks)
+    simulation.master.stop()
+    words = [frame.data[0] for frame in simulation.wire.frames if frame.can_id == 0x203 and frame.started >= 0]
+    assert [word for word, before in zip(words, [None, *words], strict=False) if word != before] == [0x0F, 0x02, 0x00]
+
+
 # Rows 18, 20, 21: what is found before anything moves
 
 
@@ -547,6 +557,39 @@ def test_a_second_drive_with_an_id_that_appears_in_motion_stops_the_arm() -> Non
 def test_a_drive_without_the_mode_does_not_start(profile: str, mode: int) -> None:
     with pytest.raises(BusError, match=rf"node 4: does not support mode {mode} .* its modes \(0x6502\) are 0x1"):
         run(scenario({"kind": "wrong_device", "node": 4}, profile=profile))
+
+
+@pytest.mark.parametrize("reached", ["set up", "switched on"])
+def test_a_start_up_that_fails_gives_the_gains_back(reached: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    gains: list[bytes] = []
+
+    def refused(*args: Any) -> None:
+        gains.append(args[0].client.read(4, 0x2020))
+        raise BusError("refused")
+
+    def watched(master: Any, parameters: Any) -> None:
+        gains.append(master.client.read(4, 0x2020))
+        try:
+            commission(master, parameters)
+        finally:
+            gains.append(master.client.read(4, 0x2020))
+
+    monkeypatch.setattr("lwa4d_sim.bus.simulation.commission", watched)
+    name = "_reach" if reached == "set up" else "_time_out"
+    monkeypatch.setattr(f"lwa4d_sim.bus.commission.{name}", refused)
+    with pytest.raises(BusError, match="refused"):
+        canopen_run(build_blocks([scenario(profile="lwa4d")], "default", 1))
+    before, during, after = gains
+    assert during == bytes(4)
+    assert before == after != during
+
+
+def test_a_drive_that_is_gone_does_not_keep_the_others_from_their_parameters() -> None:
+    simulation, _ = canopen_run(build_blocks([scenario()], "default", 1))
+    simulation.cut_off(4, power=True)
+    with pytest.raises(BusError, match="node 4: cannot write object 0x6081:00: no answer"):
+        put_back(simulation.master, [(node, (0x6081, 0), bytes((node, 0, 0, 0))) for node in (3, 4, 5)])
+    assert [node.dictionary[0x6081, 0] for node in simulation.arm.nodes][::2] == [3, 5]
 
 
 # Row 19: SDO flood
@@ -671,7 +714,12 @@ def test_drives_whose_master_has_died_stop_by_themselves(profile: str) -> None:
         ({"deadline": 0.01}, r"loop.deadline .*must be below the period of 0.01 s"),
         ({"period": 0.301}, r"loop.period .*cannot be told a period of 301 ms"),
         ({"traffic": [{"id": 0x184, "period": 0.1}]}, r"loop.traffic.0.id.*identifier 0x184 has a sender already"),
+        ({"traffic": [{"id": 0x604, "period": 0.1}]}, r"loop.traffic.0.id.*identifier 0x604 has a sender already"),
         ({"traffic": [{"id": 5, "period": 0.0002}]}, r"loop.bit_rate: 3 drives .* % of the bus"),
+        ({"traffic": [{"id": 5, "period": 1e-10}]}, r"loop.traffic.0.period .*must be a number of at least 4.7e-05"),
+        ({"heartbeat": 0.003}, r"loop.heartbeat .*must be 0 or above 0.003333 s"),
+        ({"heartbeat": 1e-9}, r"loop.heartbeat .*must be 0 or above 0.003333 s"),
+        ({"noise": {"per_bit": 1e-4}, "bit_rate": None}, r"loop.noise.per_bit.*needs frames that take time"),
     ],
     ids=str,
 )
@@ -791,6 +839,7 @@ def test_a_brake_that_fails_lets_its_joint_fall_and_is_noticed(profile: str) -> 
         (fault("short_pdo", node=4, pdo="rpdo2", size=6), r"faults.0.size.*has 6 bytes; size must be below 6"),
         (fault("foreign_frames", id=0x800), r"faults.0.id.*must be at most 2047"),
         (fault("foreign_frames", id=1, data=[0] * 9), r"faults.0.data.*at most 8 bytes"),
+        (fault("foreign_sync", period=1e-9), r"faults.0.period .*must be a number of at least 4.7e-05"),
         (fault("late_sync", delay=0), r"faults.0.delay .*must be a number above 0"),
         (fault("babbling_node", id=2048), r"must be a whole number of at least 0 and of at most 2047"),
     ],

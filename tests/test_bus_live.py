@@ -185,6 +185,10 @@ HOSTILE = [
     msgpack.packb({"arbitration_id": 0x183, "data": b"12", "dlc": 5, "is_extended_id": False}),
     msgpack.packb({"arbitration_id": 0x183, "data": bytes(64), "dlc": 64, "is_fd": True, "is_extended_id": False}),
     msgpack.packb({"arbitration_id": 0x183, "surprise": 1}),
+    msgpack.packb({"arbitration_id": 0x183, "data": b"12", "dlc": 2, "is_extended_id": [], "timestamp": 0.0}),
+    msgpack.packb({"arbitration_id": 0x183, "data": b"", "dlc": 1e9, "is_remote_frame": True, "is_extended_id": False}),
+    msgpack.packb({"arbitration_id": 0x183, "data": b"", "dlc": 0, "is_remote_frame": {}, "is_extended_id": False}),
+    msgpack.packb({"arbitration_id": 1 << 40, "data": b"", "is_extended_id": True}),
 ]
 
 
@@ -195,6 +199,10 @@ def test_hostile_datagrams_are_counted_and_passed_over(channel: str) -> None:
             sock.sendto(payload, (group, int(port)))
         other.send(frame(0x183, b"good"))
         assert [contents(msg)[3] for msg in received(one)] == [b"good"]
+        one.send(frame(0x203, b"12"))  # with an echo awaited, every frame is compared with it
+        for payload in HOSTILE:
+            sock.sendto(payload, (group, int(port)))
+        assert received(one) == []
         # python-can itself drops the FD frame
         assert one.unreadable >= len(HOSTILE) - 1
         assert one.recv(0) is None
@@ -350,6 +358,26 @@ def test_replay_of_what_is_no_log_is_one_line(text: str | None, tmp_path: Path) 
         path.write_text(text)
     with virtual(1) as (one,), pytest.raises(BusError, match="cannot read frames"):
         replay(path, one, bool, commands=True)
+
+
+@pytest.mark.parametrize("later", ["1000000.1", "1e300"])
+def test_replay_ends_when_asked_also_in_a_long_silence(later: str, tmp_path: Path) -> None:
+    path = tmp_path / "frames.log"
+    path.write_text(f"(0.0) vcan0 555#11\n({later}) vcan0 556#01\n")
+    begin = time.monotonic()
+    with virtual() as (one, other):
+        assert replay(path, one, lambda: time.monotonic() - begin > 0.3, commands=True) == (1, 0)
+        assert len(received(other, 0.1)) == 1
+    assert 0.3 < time.monotonic() - begin < 2
+
+
+def test_replay_sends_at_once_what_goes_back_in_time_and_nothing_too_long(tmp_path: Path) -> None:
+    path = tmp_path / "frames.log"
+    lines = ["(5.0) x 123#11", "(1.0) x 124#22", "(nan) x 125#", "(1.0) x 126#112233445566778899", "(1.1) x 127#"]
+    path.write_text("\n".join(lines))
+    with virtual() as (one, other):
+        assert replay(path, one, bool, commands=True) == (4, 0)
+        assert [msg.arbitration_id for msg in received(other, 0.1)] == [0x123, 0x124, 0x125, 0x127]
 
 
 # The controller side in virtual time

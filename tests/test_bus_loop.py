@@ -6,13 +6,21 @@ import re
 from pathlib import Path
 from typing import Any
 
+import can
+import h5py
 import numpy as np
 import pytest
 
 from lwa4d_sim.arm import ARMS, MODULES
 from lwa4d_sim.bus.joints import TORQUE_CONSTANT
+from lwa4d_sim.bus.options import Traffic
+from lwa4d_sim.bus.simulation import add_traffic
+from lwa4d_sim.bus.wire import BitErrors, Wire
 from lwa4d_sim.bus_plots import draw_buses
-from lwa4d_sim.errors import ScenarioError
+from lwa4d_sim.bus_timing import analyse
+from lwa4d_sim.errors import BusError, ScenarioError
+from lwa4d_sim.frame_log import FrameLog
+from lwa4d_sim.interfaces import NS_PER_S, Ns
 from lwa4d_sim.record import RunLog
 from lwa4d_sim.runner import run
 from lwa4d_sim.scenario import Scenario
@@ -143,6 +151,35 @@ def test_other_traffic_delays_the_sync() -> None:
     assert wait.max() <= 135 * 2000
 
 
+def test_a_station_of_the_traffic_in_bus_off_is_silent_and_comes_back() -> None:
+    wire = Wire(500_000, record=True)
+    wire.port("another", lambda msg, now: None)
+    add_traffic(wire, [Traffic(id=1600, period=0.005)])
+    wire.disturb(lambda msg, name: True, times=32)
+    wire.run_until(Ns(100_000_000))
+    sent = [frame.queued // 1_000_000 for frame in wire.frames if frame.outcome == "sent"]
+    assert len(wire.frames) > 32
+    assert 0 < sent[0] < 20, "bus-off for 128 times 11 bits, 2.8 ms"
+    assert sent == list(range(sent[0], 100, 5))
+
+
+def test_the_load_of_a_wire_with_errors_is_the_time_it_was_busy() -> None:
+    wire = Wire(500_000, errors=BitErrors(probability=5e-4), record=True)
+    for name in "ab":  # without another nobody would acknowledge
+        wire.port(name, lambda msg, now: None)
+    add_traffic(wire, [Traffic(id=1600, period=0.001), Traffic(id=1601, period=0.001)])
+    wire.run_until(Ns(NS_PER_S))
+    found = analyse(FrameLog.of(wire.frames), 500_000, Ns(1_000_000), 1000)
+    assert (found.log.outcome == 1).sum() > 50
+    assert found.load == pytest.approx(wire.busy / NS_PER_S, rel=1e-3)
+
+
+def test_a_set_up_that_takes_too_long_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lwa4d_sim.bus.build.STARTUP", Ns(-50_000_000))
+    with pytest.raises(BusError, match="the set-up takes longer"):
+        both("lwa4d_3dof", "cia402", PD, "next_sync")
+
+
 def test_a_bus_too_slow_for_its_cycle_is_refused() -> None:
     """At 100 kbit/s the cycle of seven joints needs more than 30 ms."""
     with pytest.raises(ScenarioError, match=r"375 % of the bus .* at least 375000 bit/s"):
@@ -156,6 +193,43 @@ def test_a_run_over_the_bus_gets_a_picture_of_it(tmp_path: Path) -> None:
     assert [picture.path.name for picture in made] == ["bus_canopen.png"]
     assert made[0].path.stat().st_size > 20_000
     assert "500 kbit/s" in made[0].title
+
+
+def test_a_silent_bus_has_a_picture_too(tmp_path: Path) -> None:
+    crash = [{"kind": "master_crash", "at": 0}]
+    _, canopen = both("lwa4d_3dof", "lwa4d", PD, "next_sync", heartbeat=0, faults=crash)
+    assert canopen.frames is not None
+    assert (canopen.frames.queued < 0).all()
+    assert [picture.path.name for picture in draw_buses({"can": canopen}, tmp_path)] == ["bus_can.png"]
+
+
+@pytest.mark.parametrize(
+    ("key", "column", "words"),
+    [
+        ("node", [99], "frames/node holds a number that is none of 0 to"),
+        ("size", [9], "frames/size holds a number that is none of 0 to 8"),
+        ("outcome", [-1], "frames/outcome holds"),
+        ("bits", [0, 0], "frames/bits does not fit"),
+        ("id", [0.0], "frames/id does not fit"),
+    ],
+)
+def test_a_record_whose_frames_make_no_sense_is_refused(
+    key: str, column: list[float], words: str, tmp_path: Path
+) -> None:
+    one = can.Message(arbitration_id=1, data=b"1", is_extended_id=False)
+    wire = Wire(500_000, record=True)
+    wire.port("a").send(one)
+    wire.port("b")
+    wire.run_until(Ns(1_000_000))
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        for name, (values, _) in FrameLog.of(wire.frames).columns().items():
+            file[name] = values
+        file.attrs["names"] = "a"
+        assert len(FrameLog.read(file)) == 1
+        del file[key]
+        file[key] = np.array(column)
+        with pytest.raises(ValueError, match=words):
+            FrameLog.read(file)
 
 
 def test_the_record_keeps_the_frames(tmp_path: Path) -> None:

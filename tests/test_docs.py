@@ -19,6 +19,7 @@ from scipy.optimize import brentq
 
 from lwa4d_sim import metrics
 from lwa4d_sim.arm import Arm, load_arm
+from lwa4d_sim.bus.stations import LAYOUTS
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.runner import run
 from lwa4d_sim.scenario import Scenario
@@ -223,6 +224,17 @@ def test_the_map_of_the_code_is_complete_and_its_order_is_that_of_the_imports() 
     for k, name in enumerate(listed):
         late = imports(files[name]) - set(listed[:k])
         assert not late, f"{name} imports {late}, which the map has behind it"
+
+
+def test_the_table_of_pdos_is_the_master_s() -> None:
+    rows = table((ROOT / "docs" / "canopen.md").read_text(encoding="utf-8"), "PDO")
+    for column, layout in (2, LAYOUTS["lwa4d"]), (3, LAYOUTS["cia402"]):
+        said = {row[0]: row[2] if row[column] == "the same" else row[column] for row in rows}
+        for pdo, items in zip(("RPDO1", "RPDO2", "TPDO1", "TPDO2"), (*layout.receive, *layout.transmit), strict=True):
+            found = re.findall(r"([0-9A-F]{4})(?::(\d))?/(\d+)", said[pdo])
+            assert [(int(index, 16), int(sub or 0), int(bits)) for index, sub, bits in found] == [
+                item[:3] for item in items
+            ]
 
 
 def test_the_table_of_benchmarks_is_that_of_the_program() -> None:

@@ -120,7 +120,7 @@ class BusArm:
             concerned = self._concerned(cob_id)
             # only requests and network management move PDOs
             self._settled = NMT < cob_id < FIRST_REQUEST or cob_id > LAST_REQUEST
-            set_point = FIRST_PDO <= cob_id < LAST_PDO
+            set_point = FIRST_PDO <= cob_id <= LAST_PDO
         deadline: Ns | None = None
         for k in concerned:
             node = self.nodes[k]
@@ -164,8 +164,6 @@ class BusArm:
         """Step the plant to the step nearest to ``now``."""
         elapsed = now - self._epoch if self._per_sync is None else self._syncs * self._per_sync
         target = (2 * elapsed + self._dt) // (2 * self._dt)
-        if self._step >= target:
-            return
         while self._step < target:
             steps = target - self._step if all(drive.steady for drive in self.drives) else 1
             self._move(steps)

@@ -20,6 +20,7 @@ from lwa4d_sim.bus.session import Session
 from lwa4d_sim.bus.simulation import STARTUP, Simulation, add_traffic
 from lwa4d_sim.bus.wire import BitErrors, Wire
 from lwa4d_sim.dynamics import Dynamics
+from lwa4d_sim.errors import ScenarioError
 from lwa4d_sim.interfaces import NS_PER_S, Estimator, Ns, to_ns
 from lwa4d_sim.loop import Tick
 from lwa4d_sim.mjcf import joint_facts
@@ -43,7 +44,7 @@ def plan_for(blocks: Blocks, loop: CanopenLoop, *, enable: bool = True) -> Plan:
         joints=_joints(blocks),
         period=period,
         immediate=loop.actuation == "immediate",
-        heartbeat=round(loop.heartbeat * 1000),
+        heartbeat=max(1, round(loop.heartbeat * 1000)) if loop.heartbeat else 0,
         deadline=to_ns(loop.deadline) if loop.deadline is not None else Ns(period // 2),
         enable=enable,
     )
@@ -53,6 +54,8 @@ def canopen_run(blocks: Blocks) -> tuple[Simulation, Iterator[Tick]]:
     """Both sides over the simulated wire: the simulation and its running loop, one tick a period."""
     loop = bus_loop(blocks.settings)
     source, estimator = _speed(blocks, loop)
+    if loop.noise.per_bit and loop.bit_rate is None:
+        raise ScenarioError("needs frames that take time, not bit_rate null", "loop.noise.per_bit")
     errors = BitErrors(probability=loop.noise.per_bit) if loop.noise.per_bit else None
     seed = blocks.infos[0].seed
     plan = plan_for(blocks, loop)
@@ -72,7 +75,9 @@ def served_arm(blocks: Blocks, bus: Connection, *, epoch: Ns, per_sync: bool) ->
     loop = bus_loop(blocks.settings)
     source, _ = _speed(blocks, loop)
     step = to_ns(loop.period) if per_sync else None
-    arm = BusArm(blocks.plant, _joints(blocks), loop.profile, source, lambda node: bus.send, epoch, step)
+    with blocks.about("loop"):
+        joints = _joints(blocks)
+    arm = BusArm(blocks.plant, joints, loop.profile, source, lambda node: bus.send, epoch, step)
     _tune(arm, blocks)
     return arm
 
@@ -83,8 +88,8 @@ def driving_session(
     """The controller side on a bus, behind an envelope that lets out a share ``torque`` of the peak torques."""
     loop = bus_loop(blocks.settings)
     source, estimator = _speed(blocks, loop)
-    plan = plan_for(blocks, loop, enable=enable)
     with blocks.about("loop"):
+        plan = plan_for(blocks, loop, enable=enable)
         check_bus(plan, loop.bit_rate, loop.traffic)
     master = Master(bus, clock, plan)
     control = blocks.control(estimator)
@@ -103,9 +108,11 @@ def _following(blocks: Blocks) -> Following | None:
 
 def write_sheets(blocks: Blocks, folder: Path) -> list[Path]:
     """Electronic data sheets of all drives, ``node3.eds`` and so on."""
-    folder.mkdir(parents=True, exist_ok=True)
     profile, paths = bus_loop(blocks.settings).profile, []
-    for joint in _joints(blocks):
+    with blocks.about("loop"):
+        joints = _joints(blocks)
+    folder.mkdir(parents=True, exist_ok=True)
+    for joint in joints:
         paths.append(folder / f"node{joint.node}.eds")
         drive_dictionary(profile, joint.node, joint).export_eds(paths[-1], joint.node)
     return paths

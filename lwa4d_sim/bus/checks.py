@@ -3,13 +3,15 @@
 from collections.abc import Iterable
 
 from lwa4d_sim.bus.commission import interpolation_period
-from lwa4d_sim.bus.master import MASTER_NODE, SYNC, Plan
+from lwa4d_sim.bus.master import MASTER_NODE, Plan
 from lwa4d_sim.bus.options import Traffic
 from lwa4d_sim.bus.response import Stream, utilisation
 from lwa4d_sim.bus.stations import LAYOUTS
+from lwa4d_sim.bus.watch import HEARTBEATS, SYNC
 from lwa4d_sim.errors import BusError, ScenarioError
 from lwa4d_sim.interfaces import NS_PER_S, Ns, to_ns
 
+SPORADIC = (0x080, 0x580, 0x600)  # EMCY, SDO answer and request: CiA 301, predefined connection set
 MEASURED = "SYNC and measurements"  # frames that must be there by the deadline
 
 
@@ -30,8 +32,16 @@ def check_bus(plan: Plan, bit_rate: int | None, traffic: Iterable[Traffic]) -> N
         raise ScenarioError(str(error), "loop.period") from error
     if plan.deadline >= plan.period:
         raise ScenarioError(f"must be below the period of {plan.period / NS_PER_S:g} s", "loop.deadline")
+    patience = HEARTBEATS * plan.heartbeat * 1_000_000
+    if 0 < patience <= plan.period:
+        raise ScenarioError(
+            f"the master sends one a cycle at most, and a drive waits for {HEARTBEATS} of these times: "
+            f"must be 0 or above {plan.period / HEARTBEATS / NS_PER_S:.4g} s",
+            "loop.heartbeat",
+        )
     mine, others = arm_streams(plan), [Stream(can_id=one.id, period=to_ns(one.period), dlc=one.size) for one in traffic]
-    seen = {stream.can_id for stream in mine}
+    # EMCY and SDO have no period, but their identifiers are taken too
+    seen = {stream.can_id for stream in mine} | {base + joint.node for joint in plan.joints for base in SPORADIC}
     for i, stream in enumerate(others):
         if stream.can_id in seen:
             raise ScenarioError(f"identifier 0x{stream.can_id:03X} has a sender already", f"loop.traffic.{i}.id")

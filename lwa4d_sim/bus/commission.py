@@ -6,16 +6,18 @@ comes with the first torque.
 
 import struct
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
-from lwa4d_sim.bus.master import FAULT, MASTER_NODE, NMT, PRE_OPERATIONAL, STATE_MASK, SWITCH_ON, TRIES, Master
+from lwa4d_sim.bus.master import MASTER_NODE, PRE_OPERATIONAL, SWITCH_ON, TRIES, Master
 from lwa4d_sim.bus.stations import NEVER, TARGET_SPEED, Key, Station
+from lwa4d_sim.bus.watch import NMT, STATE_MASK
 from lwa4d_sim.errors import BusError
 from lwa4d_sim.interfaces import Ns
 
 START = 0x01  # NMT command
 SHUTDOWN, FAULT_RESET = 0x06, 0x80  # CiA 402 controlwords
-READY, SWITCHED_ON = 0x21, 0x23  # statuswords under the mask
-SYNCHRONOUS, EVENT = 1, 255  # PDO transmission types
+READY, SWITCHED_ON, FAULT = 0x21, 0x23, 0x08  # CiA 402 statuswords under the mask, and the bit of a fault
+SYNCHRONOUS, EVENT = 1, 255  # PDO transmission types (CiA 301)
 SEARCHED = 0x01  # bit of 2050: commutation search completed (Schunk_0_63.dcf)
 ANOTHER = Ns(5_000_000)  # [ns] in which a second device with an id would have answered too (assumed)
 # A drive misses its set-points as it misses SYNC: after six periods (200E of the LWA4D, Schunk_0_63.dcf).
@@ -35,7 +37,8 @@ def commission(master: Master, parameters: Sequence[tuple[Key, str, float]] = ()
         What these objects held before, for `put_back`.
 
     Raises:
-        BusError: a drive does not answer, is not what it should be, refuses, or does not switch on.
+        BusError: a drive does not answer, is not what it should be, refuses, or does not switch on. What these objects
+            held is put back, as far as the drives let it.
     """
     for station in master.stations:
         master.frame(NMT, bytes([PRE_OPERATIONAL, station.node]))
@@ -46,8 +49,18 @@ def commission(master: Master, parameters: Sequence[tuple[Key, str, float]] = ()
         for station in master.stations
         for key, *_ in parameters
     ]
-    for station in master.stations:
-        _set_up(master, station, parameters)
+    try:
+        for station in master.stations:
+            _set_up(master, station, parameters)
+        _switch_on(master)
+    except BusError:
+        with suppress(BusError):
+            put_back(master, kept)
+        raise
+    return kept
+
+
+def _switch_on(master: Master) -> None:
     for station in master.stations:
         master.frame(NMT, bytes([START, station.node]))
     # what waited behind the requests, boot-up messages above all, comes now
@@ -61,17 +74,24 @@ def commission(master: Master, parameters: Sequence[tuple[Key, str, float]] = ()
     for station in master.stations:
         _time_out(master, station)
     master.watch.enabled = False
-    return kept
 
 
 def put_back(master: Master, kept: Sequence[Kept]) -> None:
     """Give the drives' own parameters back, after the arm has stopped: a drive without gains could not stop by itself.
 
     Raises:
-        BusError: a drive does not answer or refuses.
+        BusError: a drive does not answer or refuses; the others have theirs.
     """
+    failed: dict[int, BusError] = {}
     for node, key, data in kept:
-        master.client.write(node, *key, data)
+        if node in failed:
+            continue
+        try:
+            master.client.write(node, *key, data)
+        except BusError as error:
+            failed[node] = error
+    if failed:
+        raise next(iter(failed.values()))
 
 
 def _identify(master: Master, station: Station) -> None:

@@ -73,7 +73,7 @@ class Connection:
             else:
                 if msg is None:
                     return None
-                if type(msg.arbitration_id) is not int or msg.is_fd:
+                if not _is_classic(msg):
                     self.unreadable += 1
                 elif not (self._pending and self._is_echo(msg)):
                     if self.loggers:
@@ -133,6 +133,16 @@ def _key(msg: can.Message) -> _Key:
     return msg.arbitration_id, msg.is_extended_id, msg.is_remote_frame, bytes(msg.data)
 
 
+def _is_classic(msg: can.Message) -> bool:
+    """Whether it is a frame of a classic bus; in a datagram any field may be anything."""
+    can_id, flags = msg.arbitration_id, (msg.is_extended_id, msg.is_remote_frame, msg.is_error_frame)
+    if type(can_id) is not int or msg.is_fd is True or not all(type(flag) is bool for flag in flags):
+        return False
+    if type(msg.data) is not bytearray or type(msg.dlc) is not int or type(msg.timestamp) not in (float, int):
+        return False
+    return 0 <= can_id < (1 << 29 if msg.is_extended_id else 1 << 11) and 0 <= msg.dlc <= 8 and len(msg.data) <= 8
+
+
 def _is_about_content(error: can.CanOperationError) -> bool:
     """Whether one datagram was bad, not the bus: python-can reports both alike, but for what caused it."""
     return error.__cause__ is not None and not isinstance(error.__cause__, OSError)
@@ -154,16 +164,16 @@ def connect(interface: str, channel: str, bit_rate: int | None = None) -> Connec
     if interface not in names:
         raise BusError(f"no interface '{interface}'; python-can has {', '.join(names)}")
     options: dict[str, Any] = {}
-    if interface == "udp_multicast":
-        options = {"hop_limit": 0, "fd": False}  # stay on this machine
-        group, colon, port = channel.rpartition(":")
-        if colon and ":" not in group and port.isdecimal():
-            channel, options["port"] = group, int(port)
-    elif bit_rate is not None and interface != "virtual":
-        options = {"bitrate": bit_rate}
     try:
+        if interface == "udp_multicast":
+            options = {"hop_limit": 0, "fd": False}  # stay on this machine
+            group, colon, port = channel.rpartition(":")
+            if colon and ":" not in group and port.isdecimal():
+                channel, options["port"] = group, int(port)
+        elif bit_rate is not None and interface != "virtual":
+            options = {"bitrate": bit_rate}
         bus = can.Bus(channel=channel, interface=interface, **options)
-    except (can.CanError, OSError, ValueError, TypeError, ImportError, AttributeError, OverflowError) as error:
+    except Exception as error:  # drivers fail in many ways, some with a NameError where their library is missing
         reason = str(error) or type(error).__name__
         raise BusError(f"cannot open {interface} channel '{channel}': {' '.join(reason.split())}") from error
     made = Connection(bus, echoes=interface == "udp_multicast")

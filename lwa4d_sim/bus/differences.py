@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from canopen.objectdictionary import ObjectDictionary
 
 from lwa4d_sim.bus.checks import arm_streams
+from lwa4d_sim.bus.commission import EVENT, SYNCHRONOUS
 from lwa4d_sim.bus.dictionary import drive_dictionary
-from lwa4d_sim.bus.master import EVENT, SYNCHRONOUS, Plan
+from lwa4d_sim.bus.master import Plan
 from lwa4d_sim.bus.response import utilisation
 from lwa4d_sim.bus.stations import LAYOUTS
 from lwa4d_sim.bus.survey import NodeFound, Pdo, Survey, Surveyor

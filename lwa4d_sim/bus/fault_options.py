@@ -5,6 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Le
 
+from lwa4d_sim.bus.options import FramePeriod
 from lwa4d_sim.interfaces import STRICT, NonNegative, Positive
 
 NodeId = Annotated[int, Ge(1), Le(127)]
@@ -228,7 +229,7 @@ class ForeignSync(_Frames):
     """A second SYNC producer with a ``period`` [s] of its own."""
 
     kind: Literal["foreign_sync"]
-    period: Positive = 0.01
+    period: FramePeriod = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,7 +241,7 @@ class ForeignFrames(_Frames):
     data: tuple[Annotated[int, Ge(0), Le(255)], ...] = ()
     extended: bool = False
     remote: bool = False
-    period: Positive = 0.001
+    period: FramePeriod = 0.001
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,7 +252,7 @@ class SdoFlood(_Frames):
     node: NodeId
     request: Literal["read", "endless"] = "read"
     count: Count = 1000
-    period: Positive = 0.001
+    period: FramePeriod = 0.001
 
 
 FrameFault = LostSync | LateSync | LongSync | LostPdo | LatePdo | WrongPdo | DuplicatedPdo

@@ -1,5 +1,6 @@
 """Files of CAN frames: what the simulated wire carried written like a log of a real bus, and logs sent again."""
 
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from lwa4d_sim.interfaces import NS_PER_S
 # Time stamp [s] of a run's first instant in a written log: what is before it, the set-up from -10 s on, needs stamps of
 # at least zero.
 ORIGIN = 10
+LONGEST_GAP = 60.0  # [s]; longer silence in a log is cut down to this when it is sent again (assumed)
+NAP = 0.1  # [s], in which a replay notices that it is to end (assumed)
 # What drives obey (CiA 301, predefined connection set): network management, SYNC and time stamp, RPDOs, SDO requests.
 COMMANDS = frozenset(
     {0x000, 0x080, 0x100}.union(*(range(base + 1, base + 0x80) for base in (0x200, 0x300, 0x400, 0x500, 0x600)))
@@ -66,8 +69,12 @@ def replay(path: Path, bus: Connection, stopped: Callable[[], bool], *, commands
         BusError: the file cannot be read, or the bus does not take a frame.
     """
     sent = left_out = 0
-    for msg in can.MessageSync(_read(path), gap=0.0):
-        if stopped():
+    due, before = time.monotonic(), None
+    for msg in _read(path):
+        # no gap is negative, and what is no number is none
+        due += min(max(0.0, msg.timestamp - before), LONGEST_GAP) if before is not None else 0.0
+        before = msg.timestamp
+        if not _reached(due, stopped):
             break
         if not msg.is_extended_id and msg.arbitration_id in COMMANDS and not commands:
             left_out += 1
@@ -82,6 +89,16 @@ def replay(path: Path, bus: Connection, stopped: Callable[[], bool], *, commands
     return sent, left_out
 
 
+def _reached(due: float, stopped: Callable[[], bool]) -> bool:
+    """Sleep until an instant [s]; False when asked to end before."""
+    while not stopped():
+        left = due - time.monotonic()
+        if left <= 0:
+            return True
+        time.sleep(min(left, NAP))
+    return False
+
+
 def _read(path: Path) -> Iterator[can.Message]:
     """Data and remote frames of a log.
 
@@ -91,7 +108,7 @@ def _read(path: Path) -> Iterator[can.Message]:
     try:
         with can.LogReader(path) as reader:
             for msg in reader:
-                if not msg.is_error_frame and not msg.is_fd:
+                if not msg.is_error_frame and not msg.is_fd and msg.dlc <= 8:
                     yield msg
     except Exception as error:  # the readers fail in many ways on what is no log
         raise BusError(f"{path}: cannot read frames: {error or type(error).__name__}") from error

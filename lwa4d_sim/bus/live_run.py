@@ -148,7 +148,7 @@ def drive_arm(
         BusError: no real-time scheduling here, or the drives cannot be set up.
     """
     loop = bus_loop(blocks.settings)
-    ticks = blocks.timing.ticks if seconds is None else min(blocks.timing.ticks, math.ceil(seconds / loop.period))
+    ticks = blocks.timing.ticks if seconds is None else math.ceil(min(blocks.timing.ticks, seconds / loop.period))
     master, session = driving_session(blocks, bus, monotonic, enable=True, torque=torque)
     live = LiveRun(blocks, master, session)
     # begun before the set-up, since what it does takes longer than the drives wait for a heartbeat

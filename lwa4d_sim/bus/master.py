@@ -23,20 +23,16 @@ from lwa4d_sim.bus.stations import (
     mappings,
     torque_counts_per_newton_metre,
 )
-from lwa4d_sim.bus.watch import Watch
+from lwa4d_sim.bus.watch import ENABLED, MISSED_LIMIT, NMT, STATE_MASK, SYNC, Watch
 from lwa4d_sim.errors import BusError
 from lwa4d_sim.interfaces import NS_PER_S, Array, Ns
 
-NMT, SYNC = 0x000, 0x080  # CiA 301, predefined connection set
-START, STOP, PRE_OPERATIONAL = 0x01, 0x02, 0x80  # NMT commands
-SHUTDOWN, SWITCH_ON, QUICK_STOP, DISABLE_VOLTAGE, FAULT_RESET = 0x06, 0x07, 0x02, 0x00, 0x80  # CiA 402 controlwords
-# Statusword under the mask. A drive in fault or after a quick stop has bit 6 or 5 of its own.
-STATE_MASK, READY, SWITCHED_ON, ENABLED, QUICK_STOP_ACTIVE = 0x6F, 0x21, 0x23, 0x27, 0x07
-FAULT = 0x08
+STOP, PRE_OPERATIONAL = 0x02, 0x80  # NMT commands (CiA 301)
+SWITCH_ON, QUICK_STOP, DISABLE_VOLTAGE = 0x07, 0x02, 0x00  # CiA 402 controlwords
+QUICK_STOP_ACTIVE = 0x07  # statusword under the mask (CiA 402)
 MASTER_NODE = 127  # as which the master's heartbeat is heard (schunk_pg70, Schunk_0_63.dcf)
 HEARTBEAT_MS = 100  # LWA 4P's DCF; the LWA4D's leaves it off
 TRIES = 50  # SYNC cycles a state change may take (assumed)
-SYNCHRONOUS, EVENT = 1, 255  # PDO transmission types
 DEFIED_LIMIT = 3  # cycles in which a drive may overlook a quick stop (assumed)
 OVERTIME = 1_000_000  # [ns] for which frames that had arrived are taken in beyond an instant, were it a flood (assumed)
 
@@ -238,7 +234,7 @@ class Master:
                 self.frame(0x200 + 0x100 * i + station.node, mapping.pack_from(station.values))
 
     def stop(self) -> None:
-        """Quick stop until no drive moves, then switch off; a silent drive is not waited for.
+        """Quick stop until no drive moves, then switch off; a drive silent for 3 cycles is not waited for.
 
         Raises:
             BusError: the bus itself is gone.
@@ -249,7 +245,7 @@ class Master:
             self.sync()
             self.gather()
             moving = (ENABLED, QUICK_STOP_ACTIVE)
-            if all(station.missed or station.status & STATE_MASK not in moving for station in self.stations):
+            if not any(s.missed < MISSED_LIMIT and s.status & STATE_MASK in moving for s in self.stations):
                 break
             self.halt()
             self.wait(Ns(start + self.plan.period))

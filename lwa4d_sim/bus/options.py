@@ -5,9 +5,12 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Le, Lt
 
-from lwa4d_sim.interfaces import STRICT, NonNegative, Positive
+from lwa4d_sim.interfaces import STRICT, NonNegative
 
 Profile = Literal["lwa4d", "cia402"]
+
+# Not even a bus of 1 Mbit/s carries frames more often than its shortest of 47 bits (CAN 2.0) [s].
+FramePeriod = Annotated[float, Ge(47e-6)]
 
 FIRST_NODE = 3  # node id of joint 1; joint 7 has 9 (schunk_lwa4d, config/arm_driver.yaml)
 
@@ -38,5 +41,5 @@ class Traffic:
     __pydantic_config__: ClassVar[Any] = STRICT
     id: Annotated[int, Ge(1), Le(0x7FF)]
     size: Annotated[int, Ge(0), Le(8)] = 8
-    period: Positive
+    period: FramePeriod
     offset: NonNegative = 0.0

@@ -77,7 +77,7 @@ class Session:
         self.late = 0
         self.lateness: list[Ns] = []
         self.work: list[Ns] = []
-        self._stopping = 0
+        self._stopping = self._commanded = 0
 
     def cycles(self, start: Ns, ticks: int) -> Iterator[Cycle]:
         """Cycle by cycle from the instant ``start`` [ns]; each ends when the next is due.
@@ -141,7 +141,8 @@ class Session:
         if self._guard is not None:
             tau = self._guard.check(arrived.values[0][0], state.dq[0], tau)
         master.command(tau)
-        if k >= 2:  # the drives have had a SYNC to follow the first command, and another to say so
+        self._commanded += 1
+        if self._commanded > 2:  # the drives have had a SYNC to follow the first command, and another to say so
             master.watch.enabled = master.plan.enable
         return Cycle(k, state, command, now - np.maximum(stamp, 0))
 

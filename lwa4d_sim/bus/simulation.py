@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import can
 
@@ -15,6 +16,7 @@ from lwa4d_sim.bus.safety import Following
 from lwa4d_sim.bus.session import Control, Session
 from lwa4d_sim.bus.stations import opening
 from lwa4d_sim.bus.wire import Wire, WirePort
+from lwa4d_sim.errors import BusError
 from lwa4d_sim.frame_log import FrameLog
 from lwa4d_sim.interfaces import NS_PER_S, Ns, to_ns
 from lwa4d_sim.loop import Tick, Timing
@@ -54,12 +56,14 @@ class Simulation:
         """Set up, and hand out the running loop, one tick a period.
 
         Raises:
-            BusError: the drives cannot be set up.
+            BusError: the drives cannot be set up, or not in time.
         """
         self.master_port = self.wire.port("master")
         self.master = Master(self.master_port, lambda: self.wire.now, plan)
         self.session = Session(self.master, control, with_speed=with_speed, following=following)
         commission(self.master, opening(plan.profile))
+        if self.wire.now > 0:
+            raise BusError(f"the set-up takes longer than {-STARTUP // NS_PER_S} s of the bus's time")
         self.wire.run_until(Ns(0))
         return self._ticks(timing)
 
@@ -150,22 +154,17 @@ class Simulation:
 def add_traffic(wire: Wire, stations: Sequence[Traffic]) -> None:
     """Let other stations send on the wire."""
     for k, traffic in enumerate(stations):
-        port = wire.port(f"traffic {k + 1}", lambda msg, now: None)
-        _Sender(wire, port.send, traffic).arm()
+        _send_regularly(wire, wire.port(f"traffic {k + 1}", lambda msg, now: None, recovers=True), traffic)
 
 
-class _Sender:
-    """Sends one frame again and again."""
+def _send_regularly(wire: Wire, port: WirePort, traffic: Traffic) -> None:
+    msg = can.Message(arbitration_id=traffic.id, data=bytes(traffic.size), is_extended_id=False)
+    period = to_ns(traffic.period)
 
-    def __init__(self, wire: Wire, send: object, traffic: Traffic) -> None:
-        self._wire, self._send = wire, send
-        self._msg = can.Message(arbitration_id=traffic.id, data=bytes(traffic.size), is_extended_id=False)
-        self._period, self._next = to_ns(traffic.period), to_ns(traffic.offset)
+    def fire(due: Ns) -> None:
+        with suppress(can.CanOperationError):  # bus-off: the frame is lost
+            port.send(msg)
+        wire.call_at(Ns(due + period), partial(fire, Ns(due + period)))
 
-    def arm(self) -> None:
-        self._wire.call_at(Ns(self._next), self._fire)
-
-    def _fire(self) -> None:
-        self._send(self._msg)  # type: ignore[operator]
-        self._next = Ns(self._next + self._period)
-        self.arm()
+    first = to_ns(traffic.offset)
+    wire.call_at(first, partial(fire, first))

@@ -7,8 +7,8 @@ import can
 from lwa4d_sim.bus.stations import Station
 from lwa4d_sim.interfaces import Ns
 
-ENABLED = 0x27  # statusword of a moving drive, under the mask
-STATE_MASK = 0x6F
+# Statusword of a moving drive under the mask (CiA 402). A drive in fault or after a quick stop differs in bit 3 or 5.
+STATE_MASK, ENABLED = 0x6F, 0x27
 MOVING = (ENABLED, 0x07, 0x0F, 0x2F)  # the others: quick stop active, fault reaction active
 OPERATIONAL, BOOT_UP = 0x05, 0x00  # CiA 301, states in the heartbeat
 MISSED_LIMIT = 3  # cycles without measurements: transmission type + 2, as ros_canopen counts (canopen_master, pdo.cpp)
@@ -42,7 +42,6 @@ class Watch:
         self._stood: dict[int, float] = {}  # node: where its brake closed [rad]
         self.enabled = False
         self.events: list[tuple[Ns, str]] = []
-        self._now = Ns(0)
 
     def start(self, now: Ns) -> None:
         """Begin to expect signs of life."""
@@ -96,7 +95,6 @@ class Watch:
 
     def verdict(self, now: Ns) -> str | None:
         """The first thing wrong since the start, or None; call once a cycle, after gathering."""
-        self._now = now
         if self._wrong is not None or not self._started:
             return self._wrong
         for station in self._stations:
