@@ -184,6 +184,8 @@ def _print_summary(summary: Mapping[str, Any]) -> None:
             state = f"DIVERGED at {values['diverged_at']:.2f} s"
         errors = ", ".join("-" if e is None else f"{1e3 * e:.2f}" for e in values["final_error"])
         print(f"  {name:12} {state:26} error at segment ends [mm]: {errors}")
+        if variant["stopped"] is not None:
+            print(f"    STOPPED at {variant['stopped']['at']:.2f} s: {variant['stopped']['why']}")
         for check in variant["expect"]["checks"]:
             print(f"    {'passed' if check['passed'] else 'FAILED'}  {describe(check)}")
 

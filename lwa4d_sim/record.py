@@ -27,6 +27,9 @@ class ToolPoint(Protocol):
         ...
 
 
+STOPPED = "stopped: "  # begins the event that says why the master stopped the arm
+
+
 @dataclass(frozen=True, slots=True)
 class TickLog:
     """What happened at the control ticks, (K, ...).
@@ -101,6 +104,12 @@ class RunLog:
     def x_ref(self) -> Array:
         """Desired tool point (T, 3) [m]."""
         return self.paths.x_ref(self.t)
+
+    @property
+    def stopped(self) -> tuple[float, str] | None:
+        """When [s] and why the master on a bus stopped the arm, or None."""
+        said = [(t, text.removeprefix(STOPPED)) for t, text in self.events if text.startswith(STOPPED)]
+        return said[0] if said else None
 
     def step_at(self, t: float) -> int:
         """Index of the plant sample at time ``t`` [s]."""

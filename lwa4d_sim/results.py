@@ -54,6 +54,7 @@ def summarise(scenario: Scenario, logs: Mapping[str, RunLog]) -> dict[str, Any]:
             "metrics": values,
             "expect": {"passed": all(check.passed for check in checks), "checks": [asdict(check) for check in checks]},
             "seed": logs[name].seed,
+            "stopped": _stopped(logs[name]),
         }
     arms = sorted({settings.arm for settings in scenario.variants.values()})
     return {
@@ -70,6 +71,10 @@ def summarise(scenario: Scenario, logs: Mapping[str, RunLog]) -> dict[str, Any]:
             "models": {arm: _hash(model_path(arm, scenario.folder).read_bytes()) for arm in arms},
         },
     }
+
+
+def _stopped(log: RunLog) -> dict[str, Any] | None:
+    return None if log.stopped is None else dict(zip(("at", "why"), log.stopped, strict=True))
 
 
 def passed(summary: Mapping[str, Any]) -> bool:

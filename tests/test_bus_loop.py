@@ -22,6 +22,7 @@ from lwa4d_sim.errors import BusError, ScenarioError
 from lwa4d_sim.frame_log import FrameLog
 from lwa4d_sim.interfaces import NS_PER_S, Ns
 from lwa4d_sim.record import RunLog
+from lwa4d_sim.results import run_scenario
 from lwa4d_sim.runner import run
 from lwa4d_sim.scenario import Scenario
 
@@ -252,3 +253,27 @@ def test_the_record_keeps_the_frames(tmp_path: Path) -> None:
     here = (again.id == 0x183) & (again.queued >= 0)
     position = again.data[here][:, 4:8].copy().view("<i4")[:, 0] * MILLIDEGREE
     np.testing.assert_allclose(position, log.q[: 10 * len(position) : 10, 0], atol=0.51 * MILLIDEGREE)
+
+
+def test_a_run_that_the_master_stopped_says_so(tmp_path: Path) -> None:
+    fault = {"kind": "node_silence", "at": 0.3, "node": 4, "how": "unplugged"}
+    sampled, canopen = both("lwa4d_3dof", "lwa4d", PD, "next_sync", faults=[fault])
+    assert sampled.stopped is None
+    assert canopen.stopped is not None
+    at, why = canopen.stopped
+    assert 0.3 < at < 0.35
+    assert why == "node 4: no measurements for 3 cycles"
+    canopen.save(tmp_path / "canopen.h5")
+    assert RunLog.load(tmp_path / "canopen.h5").stopped == canopen.stopped
+    document = {"name": "stopped", "variants": {"canopen": {}}, **_only_canopen(fault)}
+    summary = run_scenario(Scenario.parse(json.dumps(document)))
+    assert summary["variants"]["canopen"]["stopped"]["why"] == why
+
+
+def _only_canopen(fault: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "arm": "lwa4d_3dof",
+        "trajectory": {"waypoints": {"space": "joint", "points": [START["lwa4d_3dof"]]}, "segment_time": 0.5},
+        "controller": PD,
+        "loop": {"kind": "canopen", "faults": [fault]},
+    }

@@ -20,7 +20,7 @@ from lwa4d_sim.errors import BusError
 from lwa4d_sim.frame_log import FrameLog
 from lwa4d_sim.interfaces import NS_PER_S, Ns, to_ns
 from lwa4d_sim.loop import Tick, Timing
-from lwa4d_sim.record import RunLog
+from lwa4d_sim.record import STOPPED, RunLog
 
 # The drives are set up before the run's first instant, with closed brakes. Seven of them need a third of a second at
 # 500 kbit/s; 10 s are enough at 20 kbit/s (assumed).
@@ -77,6 +77,10 @@ class Simulation:
         """The record of the run with the frames and what the master noted."""
         said = [(t / NS_PER_S, text) for t, text in self.master.watch.events if t >= 0]
         said += [(t / NS_PER_S, text) for t, text in self.notes]
+        fault = self.session.fault
+        if fault is not None:
+            at = next((t for t, text in said if text == fault), self.wire.now / NS_PER_S)
+            said.append((at, STOPPED + fault))
         events = tuple(sorted([*log.events, *said]))
         return replace(log, frames=FrameLog.of(self.wire.frames), events=events)
 
