@@ -589,7 +589,7 @@ def test_a_crashed_controller_leaves_closed_brakes(file: Path) -> None:
     """No orderly stop: the drives notice the silence (heartbeat) by themselves."""
     with virtual() as (arm_end, controller_end), serving(blocks_of(file), arm_end) as arm:
         blocks = blocks_of(file, **{"loop.heartbeat": 0.1})
-        master, session = driving_session(blocks, controller_end, monotonic, enable=True)
+        master, session = driving_session(blocks, controller_end, monotonic)
         LiveRun(blocks, master, session).set_up("cia402")
         for cycle in session.cycles(Ns(monotonic() + 20 * MS), 20):
             assert session.fault is None, (cycle.k, session.fault)

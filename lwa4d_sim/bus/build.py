@@ -36,7 +36,7 @@ def bus_loop(settings: Any) -> CanopenLoop:
     return replace(CanopenLoop(), **taken)
 
 
-def plan_for(blocks: Blocks, loop: CanopenLoop, *, enable: bool = True) -> Plan:
+def plan_for(blocks: Blocks, loop: CanopenLoop) -> Plan:
     """What the master is to set up."""
     period = to_ns(loop.period)
     return Plan(
@@ -46,7 +46,6 @@ def plan_for(blocks: Blocks, loop: CanopenLoop, *, enable: bool = True) -> Plan:
         immediate=loop.actuation == "immediate",
         heartbeat=max(1, round(loop.heartbeat * 1000)) if loop.heartbeat else 0,
         deadline=to_ns(loop.deadline) if loop.deadline is not None else Ns(period // 2),
-        enable=enable,
     )
 
 
@@ -83,13 +82,13 @@ def served_arm(blocks: Blocks, bus: Connection, *, epoch: Ns, per_sync: bool) ->
 
 
 def driving_session(
-    blocks: Blocks, bus: Connection, clock: Callable[[], Ns], *, enable: bool, torque: float = 1.0
+    blocks: Blocks, bus: Connection, clock: Callable[[], Ns], *, torque: float = 1.0
 ) -> tuple[Master, Session]:
     """The controller side on a bus, behind an envelope that lets out a share ``torque`` of the peak torques."""
     loop = bus_loop(blocks.settings)
     source, estimator = _speed(blocks, loop)
     with blocks.about("loop"):
-        plan = plan_for(blocks, loop, enable=enable)
+        plan = plan_for(blocks, loop)
         check_bus(plan, loop.bit_rate, loop.traffic)
     master = Master(bus, clock, plan)
     control = blocks.control(estimator)

@@ -8,14 +8,14 @@ import struct
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
-from lwa4d_sim.bus.master import MASTER_NODE, PRE_OPERATIONAL, SWITCH_ON, TRIES, Master
+from lwa4d_sim.bus.master import MASTER_NODE, PRE_OPERATIONAL, TRIES, Master
 from lwa4d_sim.bus.stations import NEVER, TARGET_SPEED, Key, Station
 from lwa4d_sim.bus.watch import NMT, STATE_MASK
 from lwa4d_sim.errors import BusError
 from lwa4d_sim.interfaces import Ns
 
 START = 0x01  # NMT command
-SHUTDOWN, FAULT_RESET = 0x06, 0x80  # CiA 402 controlwords
+SHUTDOWN, SWITCH_ON, FAULT_RESET = 0x06, 0x07, 0x80  # CiA 402 controlwords
 READY, SWITCHED_ON, FAULT = 0x21, 0x23, 0x08  # CiA 402 statuswords under the mask, and the bit of a fault
 SYNCHRONOUS, EVENT = 1, 255  # PDO transmission types (CiA 301)
 SEARCHED = 0x01  # bit of 2050: commutation search completed (Schunk_0_63.dcf)

@@ -149,7 +149,7 @@ def drive_arm(
     """
     loop = bus_loop(blocks.settings)
     ticks = blocks.timing.ticks if seconds is None else math.ceil(min(blocks.timing.ticks, seconds / loop.period))
-    master, session = driving_session(blocks, bus, monotonic, enable=True, torque=torque)
+    master, session = driving_session(blocks, bus, monotonic, torque=torque)
     live = LiveRun(blocks, master, session)
     # begun before the set-up, since what it does takes longer than the drives wait for a heartbeat
     with undisturbed(CONTROLLER if realtime else None):

@@ -28,7 +28,7 @@ from lwa4d_sim.errors import BusError
 from lwa4d_sim.interfaces import NS_PER_S, Array, Ns
 
 STOP, PRE_OPERATIONAL = 0x02, 0x80  # NMT commands (CiA 301)
-SWITCH_ON, QUICK_STOP, DISABLE_VOLTAGE = 0x07, 0x02, 0x00  # CiA 402 controlwords
+QUICK_STOP, DISABLE_VOLTAGE = 0x02, 0x00  # CiA 402 controlwords
 QUICK_STOP_ACTIVE = 0x07  # statusword under the mask (CiA 402)
 MASTER_NODE = 127  # as which the master's heartbeat is heard (schunk_pg70, Schunk_0_63.dcf)
 HEARTBEAT_MS = 100  # LWA 4P's DCF; the LWA4D's leaves it off
@@ -48,7 +48,6 @@ class Plan:
         immediate: commands act when they arrive, not at the next SYNC.
         heartbeat: producer time of the drives and the master [ms], 0 = off.
         deadline: from the SYNC [ns] to when a cycle no longer waits for measurements.
-        enable: let the drives move; without it they stay switched on with closed brakes.
     """
 
     profile: Profile
@@ -57,7 +56,6 @@ class Plan:
     immediate: bool = False
     heartbeat: int = HEARTBEAT_MS
     deadline: Ns
-    enable: bool = True
 
 
 class Bus(Protocol):
@@ -88,7 +86,7 @@ class Master:
         self.layout = LAYOUTS[plan.profile]
         self.stations = [Station(joint.node, joint) for joint in plan.joints]
         self.client = Client(self.send, lambda timeout, done: self.wait(Ns(self.clock() + round(timeout * 1e9)), done))
-        self.watch = Watch(self.stations, plan.period, plan.heartbeat)
+        self.watch = Watch(self.stations, plan.heartbeat)
         self._by_node = {station.node: station for station in self.stations}
         self._receive, self._transmit = mappings(self.layout.receive), mappings(self.layout.transmit)
         self._cob = {
@@ -202,9 +200,9 @@ class Master:
 
         Args:
             tau: torque (n,) [N m], finite; None = none.
-            control: controlword; default the one with which the drives move, if they may.
+            control: controlword; default the one with which the drives move.
         """
-        word = control if control is not None else self.layout.control if self.plan.enable else SWITCH_ON
+        word = self.layout.control if control is None else control
         torque = [0.0] * len(self.stations) if tau is None else tau.tolist()
         for station, newton_metres, scale in zip(self.stations, torque, self._scale, strict=True):
             values = station.values

@@ -143,7 +143,7 @@ class Session:
         master.command(tau)
         self._commanded += 1
         if self._commanded > 2:  # the drives have had a SYNC to follow the first command, and another to say so
-            master.watch.enabled = master.plan.enable
+            master.watch.enabled = True
         return Cycle(k, state, command, now - np.maximum(stamp, 0))
 
     def _hold_still(self) -> None:

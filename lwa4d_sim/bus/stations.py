@@ -4,16 +4,14 @@ from collections.abc import Mapping as Map
 from dataclasses import dataclass, field
 from typing import Any
 
-from lwa4d_sim.bus.dictionary import Joint
+from lwa4d_sim.bus.dictionary import MDEG_PER_RAD, Joint
 from lwa4d_sim.bus.mapping import Mapping
 from lwa4d_sim.bus.options import Profile
 from lwa4d_sim.interfaces import Ns
 
-CONTROL, STATUS, TORQUE_NOW, POSITION, SPEED = (0x6040, 0), (0x6041, 0), (0x6077, 0), (0x6064, 0), (0x606C, 0)
+CONTROL, STATUS, POSITION, SPEED = (0x6040, 0), (0x6041, 0), (0x6064, 0), (0x606C, 0)
 TARGET_TORQUE, TARGET_POSITION, TARGET_SPEED = (0x6071, 0), (0x607A, 0), (0x60FF, 0)
-OFFSET, SET_POINT, PROFILE_SPEED = (0x60B2, 0), (0x60C1, 1), (0x6081, 0)
-
-MDEG_PER_RAD = 57295.779513082323  # 360,000 millidegrees a turn (schunk_canopen_driver)
+OFFSET, SET_POINT = (0x60B2, 0), (0x60C1, 1)
 
 NEVER = Ns(-(2**62))  # the stamp of what has not come yet; virtual time may begin below zero
 

@@ -28,12 +28,11 @@ class Watch:
 
     Args:
         stations: the drives.
-        period: SYNC period [ns].
         heartbeat: producer time of the drives [ms], 0 = not watched.
     """
 
-    def __init__(self, stations: Sequence[Station], period: Ns, heartbeat: int) -> None:
-        self._stations, self._period = stations, period
+    def __init__(self, stations: Sequence[Station], heartbeat: int) -> None:
+        self._stations = stations
         self._patience = HEARTBEATS * heartbeat * 1_000_000
         self._by_node = {station.node: station for station in stations}
         self._wrong: str | None = None
