@@ -24,6 +24,7 @@ SETTLED = 0.02  # of the segment's distance: the usual 2 % band
 #: name, unit and meaning of every metric, for reports and for the keys of `expect`
 METRICS: dict[str, tuple[str, str]] = {
     "stable": ("", "no divergence and no vibration that fails to decay"),
+    "stopped": ("", "the master on a CANopen bus stopped the arm"),
     "unstable_since": ("s", "onset of the instability, or none"),
     "diverged_at": ("s", "instant at which the motion left all bounds, or none"),
     "final_error": ("m", "distance of the tool from its reference at the end of each segment"),
@@ -41,6 +42,8 @@ METRICS: dict[str, tuple[str, str]] = {
     "data_age_max": ("s", "largest age of the data the controller used"),
     "deviation": ("m", "largest distance of the tool from the variant `ideal`, per segment (when there is one)"),
 }
+
+FLAGS = ("stable", "stopped")  # those that are true or false
 
 
 def metrics(log: "RunLog") -> dict[str, Any]:
@@ -65,6 +68,7 @@ def metrics(log: "RunLog") -> dict[str, Any]:
     diverged = log.diverged_at
     values: dict[str, Any] = {
         "stable": diverged is None and since is None,
+        "stopped": log.stopped is not None,
         "unstable_since": since if since is not None else diverged,
         "diverged_at": diverged,
         "final_error": final,

@@ -15,7 +15,7 @@ from pydantic_core import ErrorDetails
 
 from lwa4d_sim.controllers import CustomController
 from lwa4d_sim.documents import Path
-from lwa4d_sim.metrics import METRICS
+from lwa4d_sim.metrics import FLAGS, METRICS
 from lwa4d_sim.settings import CHOICES, Settings
 
 # Beyond this a number in SI units (three years, a hundred thousand tons) is a mistake, and its square may overflow;
@@ -64,7 +64,7 @@ def json_schema() -> dict[str, Any]:
     names = "|".join(METRICS)
     checks = {
         "type": "object",
-        "properties": {"stable": {"type": "boolean"}},
+        "properties": {flag: {"type": "boolean"} for flag in FLAGS},
         "patternProperties": {f"^({names})_(max|min)$": numbers},
         "additionalProperties": False,
     }

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lwa4d_sim.expect import check_expectations, evaluate
-from lwa4d_sim.metrics import METRICS
+from lwa4d_sim.metrics import FLAGS, METRICS
 
 NUMBERS = st.floats(-1e6, 1e6)
 
@@ -17,7 +17,7 @@ def holds(rule: dict[str, Any], values: dict[str, Any]) -> bool:
     return outcome.passed
 
 
-@pytest.mark.parametrize("metric", [name for name in METRICS if name != "stable"])
+@pytest.mark.parametrize("metric", [name for name in METRICS if name not in FLAGS])
 @pytest.mark.parametrize("side", ["max", "min"])
 @pytest.mark.parametrize("bound", [1, 0.5, [1.0, None], [1]])
 def test_every_metric_may_be_bounded_on_either_side(metric: str, side: str, bound: Any) -> None:
@@ -35,7 +35,7 @@ def test_every_metric_may_be_bounded_on_either_side(metric: str, side: str, boun
         (
             "xyzzy",
             1,
-            "unknown expectation; valid here: stable, or one of these followed by _max or _min: unstable_since,",
+            "unknown expectation; valid here: stable, stopped, or one of these followed by _max or _min: unstable_",
         ),
         ("", 1, "unknown expectation"),
         ("_max", 1, "unknown expectation"),
@@ -97,3 +97,11 @@ def test_outcomes_tell_what_was_asked_and_found_in_the_order_asked() -> None:
         ("rms_error_max", 0.1, 0.2, False),
         ("peak_torque_min", [1, None], [2.0, 0.0], True),
     ]
+
+
+def test_a_run_that_was_stopped_fails_unless_that_is_expected() -> None:
+    values = {"stable": True, "stopped": True}
+    assert [outcome.passed for outcome in evaluate({"stable": True}, values)] == [False, True]
+    assert [outcome.passed for outcome in evaluate({"stable": True, "stopped": True}, values)] == [True, True]
+    assert evaluate({}, values) == []
+    assert [outcome.key for outcome in evaluate({"stable": True}, {"stable": True, "stopped": False})] == ["stable"]
