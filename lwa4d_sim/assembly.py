@@ -5,18 +5,19 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from lwa4d_sim.controllers import CustomController
+from lwa4d_sim.controllers import CustomController, PdGravity
 from lwa4d_sim.controllers.belief import build_beliefs
 from lwa4d_sim.errors import LwaError, ScenarioError
 from lwa4d_sim.interfaces import NS_PER_S, Array, Controller, Estimator, Ns, Trajectory, to_ns
 from lwa4d_sim.kinematics import SerialKinematics, kinematics_for
+from lwa4d_sim.lateness import compensator, computing_phase, loop_delay, reference_instants
+from lwa4d_sim.lockstep import common
 from lwa4d_sim.loop import ControllerSide, Timing
 from lwa4d_sim.mjcf import chain_of, home, load_model, torque_limits
 from lwa4d_sim.plant import Plant
@@ -27,8 +28,6 @@ from lwa4d_sim.settings import IdealLoop, SampledLoop, Settings
 
 # A run longer than this many plant steps is taken for a mistake (assumed; 5 h of simulated time at 1 ms).
 MAX_STEPS = 20_000_000
-# What members stepped together have in common, because one loop and one clock drive them all.
-_SHARED = ("arm", "loop", "plant.timestep", "plant.integrator", "plant.disturbances")
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +54,7 @@ class Blocks:
     Attributes:
         scenario, variant: where it comes from.
         settings: of the first member; the shared ones hold for all.
+        members: settings of each.
         arm: the arm on paper.
         model: the first member's plant as MuJoCo knows it.
         plant: the arm.
@@ -68,6 +68,7 @@ class Blocks:
     scenario: Scenario
     variant: str
     settings: Settings
+    members: Sequence[Settings]
     arm: PaperArm
     model: mujoco.MjModel
     plant: Plant
@@ -102,9 +103,10 @@ def build_blocks(scenarios: Sequence[Scenario], variant: str, threads: int) -> B
     scenario = scenarios[0]
     members = [one.variants[variant] for one in scenarios]
     first = members[0]
+    shared = common(first)
     for k, member in enumerate(members):
-        for key in _SHARED:
-            if attrgetter(key)(member) != attrgetter(key)(first):
+        for key, value in common(member).items() if member is not first else ():
+            if value != shared.get(key):
                 raise ScenarioError(f"{scenario.source}: member {k} of the batch differs in '{key}'; all must share it")
 
     def about(key: str) -> AbstractContextManager[None]:
@@ -116,7 +118,7 @@ def build_blocks(scenarios: Sequence[Scenario], variant: str, threads: int) -> B
         load_model(first.arm, base=scenario.folder)  # so that what is wrong from here on is wrong with the changes
     with about("plant"):
         models = [_plant_model(member, scenario.folder) for member in members]
-        shared = all(model is models[0] for model in models)
+        one_model = all(model is models[0] for model in models)
         kinematics = kinematics_for(chain_of(models[0]))
         arm = PaperArm(kinematics, home(models[0]), torque_limits(models[0]))
     with about("initial.q"):
@@ -126,17 +128,19 @@ def build_blocks(scenarios: Sequence[Scenario], variant: str, threads: int) -> B
     with about("loop.period"):
         timing = _timing(first, timestep, trajectories[0].duration)
     with about("controller"):
-        controller = _controller(members, arm)
+        controller = build_controller(members, arm)
         beliefs = [member.controller.model for member in members]
         model = build_beliefs(beliefs, first.arm, scenario.folder, threads)
     with about("plant.disturbances"):
-        plant = Plant(models[0] if shared else models, q0, first.plant.disturbances, threads)
+        plant = Plant(models[0] if one_model else models, q0, first.plant.disturbances, threads)
     space = first.controller.space
-    instant = timing.phase / NS_PER_S if not isinstance(first.loop, IdealLoop) else 0.5 * timestep / NS_PER_S
-    references = ReferenceBlocks(trajectories, space, timing.period, instant, timing.ticks)
+    with about("compensation"):
+        instants = reference_instants(members)
+    references = ReferenceBlocks(trajectories, space, timing.period, instants, timing.ticks)
 
     def control(estimator: Estimator) -> ControllerSide:
-        return ControllerSide(estimator, references, controller, model)
+        between = compensator(members, estimator, model, arm.tau_max)
+        return ControllerSide(estimator, references, controller, model, between)
 
     infos = [
         RunInfo(
@@ -155,6 +159,7 @@ def build_blocks(scenarios: Sequence[Scenario], variant: str, threads: int) -> B
         scenario=scenario,
         variant=variant,
         settings=first,
+        members=members,
         arm=arm,
         model=models[0],
         plant=plant,
@@ -222,20 +227,16 @@ def _timing(settings: Settings, timestep: Ns, duration: float) -> Timing:
         )
     if ticks == 0:
         raise ScenarioError("the motion lasts no time at all", key="trajectory")
-    phase = _phase(loop, period, timestep) if isinstance(loop, SampledLoop) else 0
+    phase = computing_phase(loop, period, timestep) if isinstance(loop, SampledLoop) else 0
     return Timing(period, Ns(phase), ticks)
 
 
-def _phase(loop: SampledLoop, period: int, timestep: int) -> int:
-    """From sample to computation, on the plant's grid and within one period."""
-    seconds = loop.transports[0].usual_longest if loop.phase is None else loop.phase
-    phase = -(-to_ns(seconds) // timestep) * timestep
-    if loop.phase is not None and phase >= period:
-        raise ScenarioError(f"phase {loop.phase} s must be shorter than the period {loop.period} s", key="loop.phase")
-    return phase % period
+def build_controller(members: Sequence[Settings], arm: PaperArm) -> Controller:
+    """The control law of some members, one row of gains each.
 
-
-def _controller(members: Sequence[Settings], arm: PaperArm) -> Controller:
+    Raises:
+        ScenarioError: they differ in kind or space, or the gains do not fit the arm.
+    """
     parameters = [member.controller for member in members]
     first = parameters[0]
     if any(type(p) is not type(first) or p.space != first.space for p in parameters):
@@ -244,6 +245,9 @@ def _controller(members: Sequence[Settings], arm: PaperArm) -> Controller:
         if any(p != first for p in parameters):
             raise ScenarioError("all members of a batch must share a controller of your own")
         return first.create()
+    if isinstance(first, PdGravity):
+        rows = [one for one in parameters if isinstance(one, PdGravity)]
+        return PdGravity.build(rows, arm.n, arm.task_size, [loop_delay(member) for member in members])
     build: Any = type(first).build  # the parameters are all of this one type, which mypy cannot know
     made: Controller = build(parameters, arm.n, arm.task_size)
     return made

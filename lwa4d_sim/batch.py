@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -84,13 +84,20 @@ def _submit(
     files: Sequence[Path], out: Path | None, plots: bool, workers: int
 ) -> tuple[ProcessPoolExecutor, list[Future[Job]]]:
     """Processes at work on ``files``. They leave Ctrl-C to this one, so that what they write is whole."""
-    # ignoring is inherited; only the main thread hears of Ctrl-C and may say what to do about it
-    heard = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if heard else None
-    try:
+    with deaf():
         # spawned, because a forked copy of a process with running threads may hang
         pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
         return pool, [pool.submit(_run_file, file, out, plots) for file in files]
+
+
+@contextmanager
+def deaf() -> Iterator[None]:
+    """Processes started in here do not hear Ctrl-C: ignoring it is inherited."""
+    # only the main thread hears of Ctrl-C and may say what to do about it
+    heard = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if heard else None
+    try:
+        yield
     finally:
         if heard:
             signal.signal(signal.SIGINT, before)

@@ -7,11 +7,12 @@ never a zero.
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from heapq import heappop, heappush
 from typing import Any
 
 import numpy as np
 
-from lwa4d_sim.delays import Latency, LatencyDraws, Loss, LossDraws
+from lwa4d_sim.delays import Latency, LatencyDraws, LatencyStream, Loss, LossDraws, LossStream
 from lwa4d_sim.errors import ScenarioError
 from lwa4d_sim.interfaces import Array, Arrived, Channel, IntArray, NonNegative, Ns, to_ns
 
@@ -39,6 +40,46 @@ class DirectChannel:
 
     def changes(self, after: Ns, before: Ns) -> list[Ns]:
         return sorted({arrival for arrival, _, _ in self._queue if after < arrival < before})
+
+
+class StaggeredChannel:
+    """A constant latency for each simulation: one queue, from which each takes in its own time.
+
+    From the first `send` on, `newest` answers for every joint, so that a simulation does not depend on its neighbours.
+    """
+
+    def __init__(self, latencies: Sequence[Ns], gate: "Gate") -> None:
+        each = np.asarray(latencies)
+        self._groups = [(int(latency), np.flatnonzero(each == latency)) for latency in np.unique(each)]
+        self._gate = gate
+        self._queue: list[tuple[int, Ns, int, tuple[Array, ...]]] = []  # a heap: by arrival, then by stamp
+        self._newest: Arrived | None = None
+
+    def send(self, stamp: Ns, values: tuple[Array, ...]) -> None:
+        for k, (latency, _) in enumerate(self._groups):
+            # the group's number keeps the heap from comparing arrays
+            heappush(self._queue, (self._gate.opens(stamp + latency), stamp, k, values))
+        if self._newest is None:
+            never = np.full((len(values[0]), 1), -1, np.int64)
+            self._newest = Arrived(never, never, tuple(np.full_like(value, np.nan) for value in values))
+
+    def newest(self, now: Ns) -> Arrived | None:
+        if not self._queue or self._queue[0][0] > now:
+            return self._newest
+        assert self._newest is not None
+        stamps, since = self._newest.stamp.copy(), self._newest.since.copy()
+        rows = [value.copy() for value in self._newest.values]
+        while self._queue and self._queue[0][0] <= now:
+            arrival, stamp, k, values = heappop(self._queue)
+            members = self._groups[k][1]
+            stamps[members], since[members] = stamp, arrival
+            for row, value in zip(rows, values, strict=True):
+                row[members] = value[members]
+        self._newest = Arrived(stamps, since, tuple(rows))
+        return self._newest
+
+    def changes(self, after: Ns, before: Ns) -> list[Ns]:
+        return sorted({Ns(item[0]) for item in self._queue if after < item[0] < before})
 
 
 class RandomChannel:
@@ -137,19 +178,48 @@ class Transport:
             base = self.latency.usual_longest
         return base + self.jitter
 
-    def build(self, seeds: Sequence[int], signal: int, n: int, gate: Gate) -> Channel:
-        """The channel of N simulations; ``signal`` tells this channel's random streams from all others.
+    @property
+    def constant(self) -> Ns | None:
+        """The latency where it is one constant for all joints and nothing is lost, else None."""
+        plain = isinstance(self.latency, (int, float)) and not self.jitter and not self.loss.probability
+        return to_ns(self.latency) if plain and isinstance(self.latency, (int, float)) else None
 
-        Raises:
-            ScenarioError: a list of latencies is not one per joint.
-        """
-        if isinstance(self.latency, tuple) and len(self.latency) != n:
+
+def build_channel(transports: Sequence[Transport], seeds: Sequence[int], signal: int, n: int, gate: Gate) -> Channel:
+    """The channel of N simulations, one transport and one seed each.
+
+    Args:
+        transports: of each simulation.
+        seeds: of each simulation.
+        signal: tells this channel's random streams from all others.
+        n: number of joints.
+        gate: when arrivals take effect.
+
+    Raises:
+        ScenarioError: a list of latencies is not one per joint.
+    """
+    for transport in transports:
+        if isinstance(transport.latency, tuple) and len(transport.latency) != n:
             raise ScenarioError(
-                f"has {len(self.latency)} values; give one number or one for each of {n} joints", key="loop.latency"
+                f"has {len(transport.latency)} values; give one number or one for each of {n} joints",
+                key="loop.latency",
             )
-        if isinstance(self.latency, (int, float)) and not self.jitter and not self.loss.probability:
-            return DirectChannel(to_ns(self.latency), gate)
-        laws, losses = ([np.random.SeedSequence(seed, spawn_key=(signal, k)) for seed in seeds] for k in (0, 1))
-        width = n if self.per_joint else 1
-        draws = LossDraws(self.loss, width, losses) if self.loss.probability else None
-        return RandomChannel(LatencyDraws(self.latency, self.jitter, width, laws), draws, gate)
+    constants = [transport.constant for transport in transports]
+    known = [latency for latency in constants if latency is not None]
+    if len(known) == len(constants):
+        return DirectChannel(known[0], gate) if len(set(known)) == 1 else StaggeredChannel(known, gate)
+    laws, losses = ([np.random.SeedSequence(seed, spawn_key=(signal, k)) for seed in seeds] for k in (0, 1))
+    widths = [n if transport.per_joint else 1 for transport in transports]
+    latencies = [
+        LatencyStream(transport.latency, transport.jitter, width, seed)
+        for transport, width, seed in zip(transports, widths, laws, strict=True)
+    ]
+    drops = None
+    if any(transport.loss.probability for transport in transports):
+        drops = LossDraws(
+            [
+                LossStream(transport.loss, width, seed)
+                for transport, width, seed in zip(transports, widths, losses, strict=True)
+            ]
+        )
+    return RandomChannel(LatencyDraws(latencies), drops, gate)

@@ -12,6 +12,9 @@ import typer
 from lwa4d_sim.bus_cli import bus_app
 from lwa4d_sim.console import Json, Out, Set, busy, complain, override, progress, scenario_path, shipped_scenarios
 from lwa4d_sim.errors import LwaError, ScenarioError
+from lwa4d_sim.stability_cli import stability
+from lwa4d_sim.sweep_cli import sweep
+from lwa4d_sim.tune_cli import tune
 
 app = typer.Typer(
     name="lwa4d-sim",
@@ -24,6 +27,9 @@ app = typer.Typer(
 
 
 app.add_typer(bus_app, name="bus")
+app.command()(stability)
+app.command()(sweep)
+app.command()(tune)
 
 
 @app.command()

@@ -124,13 +124,27 @@ class Loss:
         return self.leave * self.probability / (1.0 - self.probability)
 
 
+@dataclass(frozen=True, slots=True)
+class LatencyStream:
+    """What one simulation's latencies are drawn from: constant part or law, jitter, seed.
+
+    Attributes:
+        latency, jitter: as of a `Transport`.
+        width: draws a sample: one, or one a joint.
+        seed: of its generator.
+    """
+
+    latency: Latency
+    jitter: float
+    width: int
+    seed: np.random.SeedSequence
+
+
 class LatencyDraws:
     """Latencies [ns] of successive samples: constant part plus law plus jitter, one generator a simulation."""
 
-    def __init__(self, latency: Latency, jitter: float, width: int, seeds: Sequence[np.random.SeedSequence]) -> None:
-        self._latency, self._jitter = latency, jitter
-        self._shape = (_BLOCK, width)
-        self._generators = [np.random.default_rng(seed) for seed in seeds]
+    def __init__(self, streams: Sequence[LatencyStream]) -> None:
+        self._streams = [(stream, np.random.default_rng(stream.seed)) for stream in streams]
         self._index = 0
         self._block: IntArray = np.empty((0,), np.int64)
 
@@ -138,33 +152,47 @@ class LatencyDraws:
         """Latency of the next sample, (N, n) or broadcastable to it."""
         k = self._index % _BLOCK
         if k == 0:
-            self._block = np.stack([self._draw(rng) for rng in self._generators], axis=1)
+            drawn = [self._draw(stream, rng) for stream, rng in self._streams]
+            width = max(block.shape[1] for block in drawn)
+            self._block = np.stack([np.broadcast_to(block, (_BLOCK, width)) for block in drawn], axis=1)
         self._index += 1
         latency: IntArray = self._block[k]
         return latency
 
-    def _draw(self, rng: np.random.Generator) -> IntArray:
-        if isinstance(self._latency, TraceLatency):
-            trace = np.asarray(self._latency.values)
+    def _draw(self, stream: LatencyStream, rng: np.random.Generator) -> IntArray:
+        latency, shape = stream.latency, (_BLOCK, stream.width)
+        if isinstance(latency, TraceLatency):
+            trace = np.asarray(latency.values)
             seconds = trace[np.arange(self._index, self._index + _BLOCK) % len(trace), None]
-        elif isinstance(self._latency, (float, int, tuple)):
-            seconds = np.broadcast_to(np.asarray(self._latency, float), (_BLOCK, np.size(self._latency)))
+        elif isinstance(latency, (float, int, tuple)):
+            seconds = np.broadcast_to(np.asarray(latency, float), (_BLOCK, np.size(latency)))
         else:
-            seconds = self._latency.draw(rng, self._shape)
-        if self._jitter:
-            seconds = seconds + rng.uniform(0.0, self._jitter, self._shape)
+            seconds = latency.draw(rng, shape)
+        if stream.jitter:
+            seconds = seconds + rng.uniform(0.0, stream.jitter, shape)
         drawn: IntArray = np.rint(seconds * NS_PER_S).astype(np.int64)
         return drawn
+
+
+@dataclass(frozen=True, slots=True)
+class LossStream:
+    """What decides which of one simulation's samples are lost: law, draws a sample (one, or one a joint), seed."""
+
+    loss: Loss
+    width: int
+    seed: np.random.SeedSequence
 
 
 class LossDraws:
     """Which samples are lost, one generator a simulation."""
 
-    def __init__(self, loss: Loss, width: int, seeds: Sequence[np.random.SeedSequence]) -> None:
-        self._loss = loss
-        self._generators = [np.random.default_rng(seed) for seed in seeds]
-        self._width = width
-        self._bad = np.zeros((len(seeds), self._width), bool)
+    def __init__(self, streams: Sequence[LossStream]) -> None:
+        self._widths = [stream.width for stream in streams]
+        self._generators = [np.random.default_rng(stream.seed) for stream in streams]
+        self._leave, self._enter = (
+            np.array([[getattr(stream.loss, name)] for stream in streams]) for name in ("leave", "enter")
+        )
+        self._bad = np.zeros((len(streams), max(self._widths)), bool)
         self._index = 0
         self._block: Array = np.empty((0,))
 
@@ -172,8 +200,10 @@ class LossDraws:
         """Mask of lost data (N, n) or (N, 1)."""
         k = self._index % _BLOCK
         if k == 0:
-            self._block = np.stack([rng.random((_BLOCK, self._width)) for rng in self._generators], axis=1)
+            shape = (_BLOCK, self._bad.shape[1])
+            drawn = [rng.random((_BLOCK, width)) for rng, width in zip(self._generators, self._widths, strict=True)]
+            self._block = np.stack([np.broadcast_to(block, shape) for block in drawn], axis=1)
         self._index += 1
         u = self._block[k]
-        self._bad = np.where(self._bad, u >= self._loss.leave, u < self._loss.enter)
+        self._bad = np.where(self._bad, u >= self._leave, u < self._enter)
         return self._bad

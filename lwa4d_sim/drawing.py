@@ -147,13 +147,13 @@ def longest(logs: Iterable[RunLog]) -> RunLog:
     return max(logs, key=lambda log: len(log.q) * log.timestep)
 
 
-def canvas(title: str, log: RunLog, height: float) -> Figure:
+def canvas(title: str, name: str, height: float) -> Figure:
     """An empty figure, ``height`` inches high, with its title and the scenario's name."""
     figure = Figure(figsize=(WIDTH, height))
     FigureCanvasAgg(figure)
     top = 1 - 0.09 / height
     figure.text(0.015, top, title, va="top", weight="bold")
-    figure.text(0.985, top, plain(log.name), va="top", ha="right", color=GREY)
+    figure.text(0.985, top, plain(name), va="top", ha="right", color=GREY)
     return figure
 
 
@@ -165,7 +165,7 @@ def rows(
     onsets = [(t, text, i.colour) for i in ink.values() for t, text in i.onsets.items()]
     head = 0.82 + _LINE / 72 * len(onsets)
     height = head + 0.55 + 1.4 * len(labels)
-    figure = canvas(title, first, height)
+    figure = canvas(title, first.name, height)
     grid = figure.add_gridspec(
         len(labels),
         columns,

@@ -30,8 +30,8 @@ class Drives:
 
     Args:
         tau_max: torque limit (n,) [N m].
-        position_resolution: encoder step (n,) [rad], 0 for none.
-        torque_resolution: torque step (n,) [N m], 0 for none.
+        position_resolution: encoder step (n,) or (N, n) [rad], 0 for none.
+        torque_resolution: torque step (n,) or (N, n) [N m], 0 for none.
         late: late-data policy.
         period: control period [s], for the default timeout.
         timestep: plant step [ns].

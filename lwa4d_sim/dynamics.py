@@ -72,6 +72,12 @@ class NominalModel:
         return h
 
     @property
+    def passive(self) -> Array:
+        """Torque of springs and dampers in the joints (N, n) [N m]."""
+        passive: Array = self._field("qfrc_passive").copy()
+        return passive
+
+    @property
     def pose(self) -> Pose:
         """Tool pose: (N, 3) [m] and (N, 3, 3)."""
         if self._site < 0:

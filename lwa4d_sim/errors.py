@@ -9,7 +9,8 @@ LwaError
 │   └── JointLimitError           every branch of the inverse breaks a joint limit
 ├── TrajectoryError (ValueError)  a motion that cannot be built from what was asked
 ├── RecordError (OSError)         a record cannot be written or read
-└── BusError (OSError)            a bus, a node on it, or what it said, is not as it must be
+├── BusError (OSError)            a bus, a node on it, or what it said, is not as it must be
+└── SweepError                    a sweep cannot go on: its folder is another sweep's, it is too large, a cluster is gone
 """
 
 
@@ -60,3 +61,7 @@ class RecordError(LwaError, OSError):
 
 class BusError(LwaError, OSError):
     """A bus, a node on it, or what it said, is not as it must be."""
+
+
+class SweepError(LwaError):
+    """A sweep cannot be started or cannot go on; what it has is kept."""

@@ -23,6 +23,15 @@ NS_PER_S = 1_000_000_000
 STRICT: Any = {"extra": "forbid", "allow_inf_nan": False}
 
 
+def bare_key(name: str) -> str:
+    """The key of a parameter class's field: a word that Python keeps for itself, such as `from`, ends in `_` there."""
+    return name.rstrip("_")
+
+
+# For classes that have such a field.
+STRICT_BARE: Any = {**STRICT, "alias_generator": bare_key}
+
+
 def to_ns(seconds: float) -> Ns:
     """Seconds to the nearest nanosecond, the only place where time is rounded."""
     return Ns(round(seconds * NS_PER_S))
@@ -72,7 +81,7 @@ class TaskReference(NamedTuple):
 class Measurement(NamedTuple):
     """What the drives latched: ``q`` (N, n) [rad] and, when a drive estimates it, ``dq`` (N, n) [rad/s].
 
-    ``stamp`` [ns], (N, n) or (1, 1), is the instant each joint was sampled; joints may differ in age. A joint that has
+    ``stamp`` [ns], (N, n), (N, 1) or (1, 1), is the instant each joint was sampled; joints may differ in age. A joint that has
     never been heard of has stamp -1.
     """
 
@@ -85,7 +94,8 @@ class Arrived(NamedTuple):
     """The newest data at an instant, joint by joint.
 
     Attributes:
-        stamp: when each joint's datum was made [ns], (N, n) or, when all are alike, (1, 1); -1 where none has arrived.
+        stamp: when each joint's datum was made [ns], (N, n), or (N, 1) or (1, 1) where joints or all are alike; -1 where
+            none has arrived.
         since: when it arrived [ns], shaped likewise.
         values: the data, each (N, n).
     """

@@ -77,6 +77,18 @@ class References(Protocol):
         ...
 
 
+class Between(Protocol):
+    """What sits between estimator, law and link, as the controller's side sees it."""
+
+    def ahead(self, estimate: JointState, meas: Measurement, now: Ns) -> JointState:
+        """The state that the law is given in place of the ``estimate``."""
+        ...
+
+    def command(self, tau: Array, k: int, now: Ns) -> Array:
+        """The command that goes out in place of the law's torque (N, n) at tick ``k``; NaN stays NaN."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Link:
     """Measurements go up, commands come down."""
@@ -171,15 +183,23 @@ class ArmSide:
 
 
 class ControllerSide:
-    """Estimator, trajectory and control law."""
+    """Estimator, trajectory and control law, and what may sit between them and the link."""
 
-    def __init__(self, estimator: Estimator, references: References, controller: Controller, model: ArmModel) -> None:
+    def __init__(
+        self,
+        estimator: Estimator,
+        references: References,
+        controller: Controller,
+        model: ArmModel,
+        between: Between | None = None,
+    ) -> None:
         self._estimator, self._references = estimator, references
         self._controller, self._model = controller, model
+        self._between = between
         self._ready = False
 
     def tick(self, arrived: Arrived, now: Ns, k: int, start: tuple[Array, ...]) -> tuple[JointState, Array]:
-        """Estimate, compute.
+        """Estimate, compute; the state handed back is the estimate, whatever the law is given.
 
         A joint that was never heard of is taken to be where it was at the ``start``, so that nothing jumps when it
         speaks; until every joint of an arm has spoken, that arm's state and torque are NaN outside.
@@ -193,11 +213,12 @@ class ControllerSide:
             values = tuple(np.where(known, value, first) for value, first in zip(values, start, strict=True))
         meas = Measurement(arrived.stamp, values[0], values[1] if len(values) > 1 else None)
         state = self._estimator.update(meas, now)
-        tau = self._controller.torque(state, self._references.at(k), self._model)
+        given = state if self._between is None else self._between.ahead(state, meas, now)
+        tau = self._controller.torque(given, self._references.at(k), self._model)
         if heard is not None and not self._ready:
             state = JointState(np.where(heard, state.q, np.nan), np.where(heard, state.dq, np.nan))
             tau = np.where(heard, tau, np.nan)
-        return state, tau
+        return state, tau if self._between is None else self._between.command(tau, k, now)
 
 
 def simulate(arm: ArmSide, control: ControllerSide, link: Link, timing: Timing, timestep: Ns) -> Iterator[Tick]:

@@ -211,7 +211,7 @@ def _violent(log: RunLog) -> float:
 def _path(logs: _Logs, ink: _Inks) -> _Made:
     title = "Path of the tool"
     log = longest(logs.values())
-    figure = canvas(title, log, 6.2)
+    figure = canvas(title, log.name, 6.2)
     ax: Any = figure.add_axes((0.0, 0.04, 1.0, 0.88), projection="3d", computed_zorder=False)
     reference = log.x_ref
     steps = np.linalg.norm(np.diff(reference, axis=0), axis=1)

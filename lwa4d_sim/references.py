@@ -51,15 +51,22 @@ class ReferenceBlocks:
         trajectories: one for each simulation, or a single one for all.
         space: joint or task.
         period: control period [ns].
-        offset: from tick to the instant the reference is taken [s].
+        offsets: from tick to the instant the reference is taken [s]: one for each simulation, or a single one for all.
         ticks: number of ticks.
     """
 
     def __init__(
-        self, trajectories: Sequence[Trajectory], space: Literal["joint", "task"], period: Ns, offset: float, ticks: int
+        self,
+        trajectories: Sequence[Trajectory],
+        space: Literal["joint", "task"],
+        period: Ns,
+        offsets: Sequence[float],
+        ticks: int,
     ) -> None:
-        self._trajectories, self._space = trajectories, space
-        self._period, self._offset, self._ticks = period / NS_PER_S, offset, ticks
+        rows = max(len(trajectories), len(offsets))
+        self._motions = [(trajectories[k % len(trajectories)], offsets[k % len(offsets)]) for k in range(rows)]
+        self._space = space
+        self._period, self._ticks = period / NS_PER_S, ticks
         self._type: Any = JointReference if space == "joint" else TaskReference
         self._start = -_BLOCK
         self._block: list[Any] = []
@@ -73,9 +80,10 @@ class ReferenceBlocks:
         return self._block[i]
 
     def _sample(self, k: int) -> None:
-        t = np.arange(k, min(k + _BLOCK, self._ticks)) * self._period + self._offset
+        t = np.arange(k, min(k + _BLOCK, self._ticks)) * self._period
         sampled = [
-            trajectory.joint(t) if self._space == "joint" else trajectory.task(t) for trajectory in self._trajectories
+            trajectory.joint(t + offset) if self._space == "joint" else trajectory.task(t + offset)
+            for trajectory, offset in self._motions
         ]
         self._start = k
         columns = [

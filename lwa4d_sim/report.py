@@ -1,13 +1,9 @@
 """One self-contained HTML page about one or several finished scenarios."""
 
-import base64
 import json
-import math
-import os
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,13 +11,13 @@ from lwa4d_sim.drawing import Picture
 from lwa4d_sim.errors import RecordError
 from lwa4d_sim.expect import Outcome
 from lwa4d_sim.metrics import METRICS
+from lwa4d_sim.page import number, write_page
 from lwa4d_sim.plots import draw_all, pictures
 from lwa4d_sim.record import RunLog
 from lwa4d_sim.verdict import Run, headline, remarks
 
 _T = TypeVar("_T")
 _KINDS: Mapping[type, str] = {dict: "a mapping", list: "a list", str: "text", bool: "true or false"}
-NONE = "\u2013"  # an en dash stands for a number that does not exist
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,39 +156,7 @@ def write_report(path: Path, sections: Sequence[Section]) -> None:
     Raises:
         RecordError: a figure cannot be read or the page cannot be written.
     """
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters.update(number=number, bound=bound, embed=_embed)
-    template = environment.from_string(files("lwa4d_sim").joinpath("report.html.j2").read_text(encoding="utf-8"))
-    partial = path.with_name(path.name + ".part")
-    try:
-        partial.write_text(template.render(sections=sections), encoding="utf-8", errors="backslashreplace")
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise RecordError(f"{path}: cannot write the report ({error})") from error
-
-
-def _embed(figure: Picture) -> str:
-    """The picture as a data URI."""
-    return "data:image/png;base64," + base64.b64encode(figure.path.read_bytes()).decode()
-
-
-def number(value: Any) -> str:
-    """A metric as a table shows it: three digits, lists with commas, a dash for what does not exist."""
-    if value is None:
-        return NONE
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, (list, tuple)):
-        return ", ".join(map(number, value))
-    if isinstance(value, (int, float)):
-        if value == 0 or not math.isfinite(value):
-            return f"{value:g}"
-        # plain digits where they are few, powers of ten elsewhere
-        return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
-    return str(value)
+    write_page(path, "report.html.j2", filters={"bound": bound}, sections=sections)
 
 
 def bound(outcome: Outcome) -> str:

@@ -2,17 +2,14 @@
 
 import hashlib
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from lwa4d_sim.assembly import versions
-from lwa4d_sim.errors import RecordError, ScenarioError
 from lwa4d_sim.expect import evaluate
+from lwa4d_sim.folders import claim, written_whole
 from lwa4d_sim.mjcf import model_path
 from lwa4d_sim.record import RunLog
 from lwa4d_sim.runner import measure, run_all
@@ -36,7 +33,7 @@ def run_scenario(scenario: Scenario, out: Path | None = None, *, plots: bool = F
         ScenarioError and other LwaErrors: bad input, nothing is written.
         RecordError: the folder cannot be written.
     """
-    folder = None if out is None else _claim(out, scenario.name)
+    folder = None if out is None else claim(out / scenario.name, _OURS)
     logs = run_all(scenario)
     summary = summarise(scenario, logs)
     if folder is not None:
@@ -86,36 +83,8 @@ def _hash(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _claim(out: Path, name: str) -> Path:
-    """The scenario's folder, after making sure that it may be written, before any work is done.
-
-    Raises:
-        ScenarioError: ``out`` cannot be written, or the folder holds something that is not a run's result.
-    """
-    folder = out / name
-    try:
-        # the nearest folder that is there already, so that bad input leaves not even an empty folder behind
-        with tempfile.TemporaryFile(dir=next(place for place in (out, *out.absolute().parents) if place.exists())):
-            pass
-        foreign = (
-            next((entry for entry in folder.iterdir() if entry.suffix not in _OURS), None) if folder.exists() else None
-        )
-    except OSError as error:
-        raise ScenarioError(
-            f"{out}: cannot write results here: {error.strerror}; choose another folder with -o"
-        ) from error
-    if foreign is not None:
-        raise ScenarioError(f"{folder}: holds '{foreign.name}', which no run wrote; choose another folder with -o")
-    return folder
-
-
 def _write(folder: Path, scenario: Scenario, logs: Mapping[str, RunLog], summary: dict[str, Any], plots: bool) -> None:
-    """Write into a temporary folder beside ``folder`` and put it in place when all is there."""
-    partial = None
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent))
-        partial.chmod(0o755)
+    with written_whole(folder) as partial:
         for name, log in logs.items():
             log.save(partial / f"{name}.h5")
         (partial / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
@@ -123,15 +92,3 @@ def _write(folder: Path, scenario: Scenario, logs: Mapping[str, RunLog], summary
             from lwa4d_sim.report import section_from_folder, write_report  # matplotlib costs half a second to import
 
             write_report(partial / "report.html", [section_from_folder(partial)])
-        if folder.exists():
-            retired = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".old", dir=folder.parent))
-            os.replace(folder, retired / folder.name)
-            os.replace(partial, folder)
-            shutil.rmtree(retired, ignore_errors=True)
-        else:
-            os.replace(partial, folder)
-    except OSError as error:
-        raise RecordError(f"{folder}: cannot write the results ({error})") from error
-    finally:
-        if partial is not None:
-            shutil.rmtree(partial, ignore_errors=True)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from lwa4d_sim.assembly import Blocks, build_blocks
-from lwa4d_sim.channels import Gate
+from lwa4d_sim.channels import Gate, build_channel
 from lwa4d_sim.drives import Drives
 from lwa4d_sim.errors import ScenarioError
 from lwa4d_sim.estimators import Midpoint, TrueSource
@@ -38,7 +38,7 @@ def run(scenario: Scenario, variant: str | None = None) -> RunLog:
         ModelError, KinematicsError, TrajectoryError: the arm or the motion cannot be built; the message says where.
     """
     name = _variant(scenario, variant)
-    return _run_together([scenario], name, threads=1)[0]
+    return run_together([scenario], name, threads=1)[0]
 
 
 def run_all(scenario: Scenario) -> dict[str, RunLog]:
@@ -66,7 +66,8 @@ def run_batch(
     """Run many variations of one scenario in lock step and hand out their logs in order.
 
     Every member equals the run of the same settings alone, bit for bit. Members may differ in start, plant, motion,
-    gains, belief and seed, not in arm, loop, plant step or duration.
+    gains, belief, seed, and in the loop's latency, jitter, loss and resolutions as long as its phase stays the same;
+    not in arm, the rest of the loop, plant step or duration.
 
     Args:
         scenario: the scenario.
@@ -83,13 +84,13 @@ def run_batch(
     while start < len(members):
         chunk = [scenario.changed(member, name) for member in members[start : start + size]]
         start += size
-        for log in _run_together(chunk, name, threads):
+        for log in run_together(chunk, name, threads):
             whole = 3 * log.q[0].nbytes * log.step_at(log.knots[-1])  # even where this one run was cut short
             size = max(LEAST_CHUNK, RECORD_BUDGET // whole)
             yield log
 
 
-def _run_together(scenarios: Sequence[Scenario], variant: str, threads: int) -> list[RunLog]:
+def run_together(scenarios: Sequence[Scenario], variant: str, threads: int) -> list[RunLog]:
     """Run one variant of some scenarios in lock step; all but the shared settings may differ.
 
     Raises:
@@ -99,7 +100,7 @@ def _run_together(scenarios: Sequence[Scenario], variant: str, threads: int) -> 
     """
     canopen = isinstance(scenarios[0].variants[variant].loop, CanopenLoop)
     if canopen and len(scenarios) > 1:
-        return [_run_together([one], variant, 1)[0] for one in scenarios]  # each has a bus of its own
+        return [run_together([one], variant, 1)[0] for one in scenarios]  # each has a bus of its own
     blocks = build_blocks(scenarios, variant, threads)
     bus = None
     with blocks.about("loop"):
@@ -122,15 +123,19 @@ def _loop(blocks: Blocks) -> tuple[Link, Drives, Any, Any]:
     timestep, q0, n = blocks.timestep, blocks.q0, blocks.arm.n
     dt = timestep / NS_PER_S
     given = blocks.settings.loop
-    loop = given if isinstance(given, SampledLoop) else SampledLoop(period=dt)
-    up, down = loop.transports
+    loops = [one.loop if isinstance(one.loop, SampledLoop) else SampledLoop(period=dt) for one in blocks.members]
+    loop = loops[0]
+    up, down = zip(*(one.transports for one in loops), strict=True)
     seeds = [info.seed for info in blocks.infos]
     sync = blocks.timing.period if loop.actuation == "next_sync" else 0
-    link = Link(up.build(seeds, _MEASUREMENT, n, Gate(1)), down.build(seeds, _COMMAND, n, Gate(timestep, sync)))
+    link = Link(
+        build_channel(up, seeds, _MEASUREMENT, n, Gate(1)),
+        build_channel(down, seeds, _COMMAND, n, Gate(timestep, sync)),
+    )
     drives = Drives(
         blocks.arm.tau_max,
-        position_resolution=_resolution(loop.position_resolution, n, "loop.position_resolution"),
-        torque_resolution=_resolution(loop.torque_resolution, n, "loop.torque_resolution"),
+        position_resolution=_resolution([one.position_resolution for one in loops], n, "loop.position_resolution"),
+        torque_resolution=_resolution([one.torque_resolution for one in loops], n, "loop.torque_resolution"),
         late=loop.late_data,
         period=loop.period,
         timestep=timestep,
@@ -141,11 +146,16 @@ def _loop(blocks: Blocks) -> tuple[Link, Drives, Any, Any]:
     return link, drives, source, estimator
 
 
-def _resolution(value: Any, n: int, key: str) -> Array | None:
-    steps = np.atleast_1d(np.asarray(value, float))
-    if len(steps) not in (1, n):
-        raise ScenarioError(f"has {len(steps)} values; give one number or one for each of {n} joints", key=key)
-    return np.broadcast_to(steps, (n,)).copy() if steps.any() else None
+def _resolution(values: Sequence[float | tuple[float, ...]], n: int, key: str) -> Array | None:
+    """Steps of each simulation's joints, (1, n) where all are alike, else (N, n); None where none rounds."""
+    rows = []
+    for value in values if any(value != values[0] for value in values) else values[:1]:
+        steps = np.atleast_1d(np.asarray(value, float))
+        if len(steps) not in (1, n):
+            raise ScenarioError(f"has {len(steps)} values; give one number or one for each of {n} joints", key=key)
+        rows.append(np.broadcast_to(steps, (n,)))
+    made = np.stack(rows)
+    return made if made.any() else None
 
 
 def _variant(scenario: Scenario, variant: str | None) -> str:

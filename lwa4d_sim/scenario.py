@@ -14,11 +14,12 @@ from lwa4d_sim.settings import CHOICES, Settings
 from lwa4d_sim.yaml_text import parse
 
 DEFAULT_VARIANT = "default"  # the one variant of a scenario that names none
-_VARIANT_KEYS = ("arm", "initial", "plant", "trajectory", "controller", "loop")
+_VARIANT_KEYS = ("arm", "initial", "plant", "trajectory", "controller", "compensation", "loop")
 _TOP_KEYS = ("name", *_VARIANT_KEYS, "variants", "expect")
 _LARGEST = 10_000_000  # [bytes]; no scenario is that long, but a device file is
 _NAME_BYTES = 200  # file systems take 255, and a temporary name is a little longer than the name
-_NAME_RULE = f'must be text that can name a file: printable, at most {_NAME_BYTES} bytes, without / \\ : * ? " < > |'
+#: what the name of a scenario, a variant or a sweep must be
+NAME_RULE = f'must be text that can name a file: printable, at most {_NAME_BYTES} bytes, without / \\ : * ? " < > |'
 
 
 @dataclass(frozen=True)
@@ -59,14 +60,8 @@ class Scenario:
             ScenarioError: the file cannot be read or is not a scenario; says file, line, key, value and rule.
         """
         path = Path(path)
-        source = one_line(str(path))
-        try:
-            with path.open("rb") as file:
-                text = file.read(_LARGEST).decode("utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "it is not a text file (UTF-8)"
-            raise ScenarioError(f"{source}: cannot read the scenario: {reason}") from error
-        return Scenario.parse(text, source=source, folder=path.parent, overrides=overrides)
+        text = read_text(path, "scenario")
+        return Scenario.parse(text, source=one_line(str(path)), folder=path.parent, overrides=overrides)
 
     @staticmethod
     def parse(
@@ -137,15 +132,15 @@ class Scenario:
         for key in self.document:
             if key not in _TOP_KEYS:
                 raise self.error((key,), unknown_key(key, _TOP_KEYS))
-        if not _can_name_a_file(self.document.get("name")):
-            raise self.error(("name",), _NAME_RULE)
+        if not can_name_a_file(self.document.get("name")):
+            raise self.error(("name",), NAME_RULE)
         for key in ("variants", "expect"):
             value = self.document.get(key)
             if value is not None and not isinstance(value, Mapping):
                 raise self.error((key,), "must be a mapping of variant names")
         for variant, changes in (self.document.get("variants") or {}).items():
-            if not _can_name_a_file(variant):
-                raise self.error(("variants", variant), f"a variant's name {_NAME_RULE}")
+            if not can_name_a_file(variant):
+                raise self.error(("variants", variant), f"a variant's name {NAME_RULE}")
             if changes is not None and not isinstance(changes, Mapping):
                 raise self.error(("variants", variant), "must be a mapping of overrides, or {}")
             for key in changes or {}:
@@ -154,7 +149,7 @@ class Scenario:
 
     def _settings(self, variant: str) -> Settings:
         try:
-            return fit(self.resolved(variant))
+            return fit(self.resolved(variant), Settings)
         except Misfit as misfit:
             raise self.error(misfit.path, misfit.rule, variant) from None
 
@@ -216,7 +211,22 @@ class Scenario:
 _ABSENT = object()
 
 
-def _can_name_a_file(name: Any) -> bool:
+def read_text(path: Path, what: str) -> str:
+    """Text of a YAML file.
+
+    Raises:
+        ScenarioError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return file.read(_LARGEST).decode("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not a text file (UTF-8)"
+        raise ScenarioError(f"{one_line(str(path))}: cannot read the {what}: {reason}") from error
+
+
+def can_name_a_file(name: Any) -> bool:
+    """Whether `NAME_RULE` holds."""
     return (
         isinstance(name, str)
         and 0 < len(name.encode("utf-8", "replace")) <= _NAME_BYTES

@@ -7,7 +7,7 @@ import types
 import typing
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import TypeAdapter, ValidationError
@@ -15,12 +15,15 @@ from pydantic_core import ErrorDetails
 
 from lwa4d_sim.controllers import CustomController
 from lwa4d_sim.documents import Path
+from lwa4d_sim.interfaces import bare_key
 from lwa4d_sim.metrics import FLAGS, METRICS
 from lwa4d_sim.settings import CHOICES, Settings
 
 # Beyond this a number in SI units (three years, a hundred thousand tons) is a mistake, and its square may overflow;
 # below the other a time constant is. Assumed.
 _LARGEST, _SMALLEST = 1e8, 1e-12
+
+_T = TypeVar("_T")
 
 
 class Misfit(Exception):
@@ -36,18 +39,19 @@ class Misfit(Exception):
         self.path, self.rule = path, rule
 
 
-def fit(document: Any) -> Settings:
-    """The typed settings in ``document``.
+def fit(document: Any, cls: type[_T]) -> _T:
+    """The parameter class ``cls`` filled from ``document``.
 
     Raises:
         Misfit: with the first thing wrong, from the top down.
     """
     reading = _Reading()
-    resolved = reading.resolve((Settings,), document, ())
+    resolved = reading.resolve((cls,), document, ())
     try:
-        return _adapter().validate_json(json.dumps(resolved), strict=True)
+        made: _T = _adapter(typing.cast(Any, cls)).validate_json(json.dumps(resolved), strict=True)
     except ValidationError as error:
         raise reading.explain(error.errors(include_url=False, include_context=False), resolved) from None
+    return made
 
 
 def json_schema() -> dict[str, Any]:
@@ -55,7 +59,7 @@ def json_schema() -> dict[str, Any]:
 
     A variant's overrides are checked by name only: what they must hold depends on what they are merged into.
     """
-    schema = _adapter().json_schema()
+    schema = _adapter(Settings).json_schema()
     settings: dict[str, Any] = schema["properties"]
     override: dict[str, Any] = {key: {} for key in settings if key != "name"}
     variant = {"type": ["object", "null"], "properties": override, "additionalProperties": False}
@@ -78,15 +82,15 @@ def json_schema() -> dict[str, Any]:
 
 
 @cache
-def _adapter() -> TypeAdapter[Settings]:
-    return TypeAdapter(Settings)
+def _adapter(cls: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(cls)
 
 
 @cache
 def _fields(cls: Any) -> dict[str, Any]:
-    """Field names and resolved types of a parameter class."""
+    """Keys and resolved types of a parameter class."""
     hints = typing.get_type_hints(cls, include_extras=True)
-    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
+    return {bare_key(field.name): hints[field.name] for field in dataclasses.fields(cls)}
 
 
 @cache
@@ -117,6 +121,13 @@ def _items(members: tuple[Any, ...], i: int) -> tuple[Any, ...]:
     )
 
 
+@cache
+def _values(members: tuple[Any, ...]) -> tuple[Any, ...]:
+    """What the values of a mapping with free keys may be."""
+    mappings = [typing.get_args(_bare(m)) for m in members if typing.get_origin(_bare(m)) is Mapping]
+    return tuple(inner for args in mappings for inner in _members(args[1]))
+
+
 class _Reading:
     """What each place of one document may hold, and which class each of its mappings means."""
 
@@ -129,7 +140,9 @@ class _Reading:
         self._valid[path] = members
         if isinstance(node, Mapping):
             classes = [member for member in members if dataclasses.is_dataclass(member)]
-            return self._resolve_mapping(classes, dict(node), path) if classes else node
+            if classes:
+                return self._resolve_mapping(classes, dict(node), path)
+            return {key: self.resolve(_values(members), value, (*path, key)) for key, value in node.items()}
         if isinstance(node, list):
             return [self.resolve(_items(members, i), value, (*path, i)) for i, value in enumerate(node)]
         if isinstance(node, (int, float)) and float in map(_bare, members):
@@ -149,8 +162,9 @@ class _Reading:
                 raise Misfit((*path, key), unknown_key(key, fields))
         for field in dataclasses.fields(cls):
             required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-            if required and field.name not in node:
-                raise Misfit((*path, field.name), f"is missing; it must be {_wanted(_members(fields[field.name]))}")
+            key = bare_key(field.name)
+            if required and key not in node:
+                raise Misfit((*path, key), f"is missing; it must be {_wanted(_members(fields[key]))}")
         self._chosen[path] = cls.__name__
         return {key: self.resolve(_members(fields[key]), value, (*path, key)) for key, value in node.items()}
 

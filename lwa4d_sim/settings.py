@@ -12,18 +12,22 @@ from annotated_types import Ge, Le, Lt
 from lwa4d_sim.bus.fault_options import Fault
 from lwa4d_sim.bus.options import Noise, Profile, Traffic
 from lwa4d_sim.channels import Transport
+from lwa4d_sim.compensation import Compensation
 from lwa4d_sim.controllers import ControllerParameters
 from lwa4d_sim.delays import Latency, Loss
 from lwa4d_sim.drives import LateData
 from lwa4d_sim.edits import ArmEdits
-from lwa4d_sim.estimators import FilteredDerivative, VelocityParameters
+from lwa4d_sim.estimators import FilteredDerivative
+from lwa4d_sim.estimators import VelocityParameters as PlainVelocity
 from lwa4d_sim.interfaces import STRICT, NonNegative, Positive
+from lwa4d_sim.observers import ObserverVelocity
 from lwa4d_sim.plant import Disturbance
 from lwa4d_sim.trajectories import FourierMotion, SampledMotion, WaypointMotion
 
 _Share = Annotated[float, Ge(0), Lt(1)]
 
 TrajectoryParameters = WaypointMotion | FourierMotion | SampledMotion
+VelocityParameters = PlainVelocity | ObserverVelocity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,6 +199,7 @@ class Settings:
         plant: the arm as it is.
         trajectory: the motion asked for.
         controller: control law, gains and belief.
+        compensation: what wins back gain lost to the bus.
         loop: what lies between controller and arm.
     """
 
@@ -205,6 +210,7 @@ class Settings:
     plant: PlantSettings = PlantSettings()
     trajectory: TrajectoryParameters
     controller: ControllerParameters
+    compensation: Compensation | None = None
     loop: LoopSettings = field(default_factory=SampledLoop)
 
 

@@ -32,6 +32,12 @@ for _tag, _pattern, _first in (
     _Loader.add_implicit_resolver(_TAG + _tag, re.compile(f"^(?:{_pattern})$"), _first)
 
 
+def dump(document: Any) -> str:
+    """Plain data as YAML that `parse` reads back; short lists and mappings stand on one line."""
+    text: str = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
+    return text
+
+
 def parse(text: str, source: str, *, numbered: bool = True) -> tuple[Any, dict[Path, int]]:
     """Plain data (dict, list, str, int, float, bool, None) and the line of every path in it.
 

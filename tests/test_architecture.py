@@ -27,8 +27,11 @@ ROWS = (
     # blocks
     "motion_files motions delays controllers.gains controllers.belief",
     "controllers.task",
+    "controllers.shaping",
     "controllers.pd_gravity controllers.computed_torque controllers.custom",
-    "trajectories references estimators channels drives plant controllers",
+    "trajectories references estimators channels drives plant controllers forecast",
+    "observers",
+    "compensation",
     # the bus: a CAN controller and its wire, a CANopen node, a CiA 402 drive, and the master
     "bus bus.options bus.frames bus.transmission bus.entry bus.objects bus.mapping bus.device "
     "bus.cia402 bus.motion bus.brake bus.client bus.process bus.candump",
@@ -52,21 +55,37 @@ ROWS = (
     # composition
     "documents",
     "settings yaml_text",
-    "schema",
+    "schema lockstep",
+    "lateness",
     "scenario",
     "assembly",
     "bus.build",
     "bus.live_run runner",
+    # how far from shaking
+    "stability stability.filters stability.linear stability.margins stability.assist",
+    "stability.loops",
+    "stability.sampled",
+    "stability.jitter stability.instants stability.tracking",
+    "stability.study",
+    "stability.motion stability.maps stability.analysis stability.boundary",
+    "tuning",
+    "tuned_file",
     # work
-    "verdict",
-    "drawing video",
-    "plots bus_timing",
-    "bus_plots",
-    "report",
-    "results",
+    "verdict folders page stability_guides",
+    "drawing video stability_findings",
+    "plots bus_timing stability_words stability_tables",
+    "bus_plots stability_plots",
+    "report stability_map stability_report",
+    "results stability_folder",
     "batch",
+    "sweep_design sweep_work sweep_statistics",
+    "sweep_file sweep_workers sweep_plots",
+    "sweep_cluster sweep_table sweep_run",
+    "sweep_search",
+    "sweep",
+    "sweep_summary sweep_report",
     "console",
-    "bus_tables",
+    "bus_tables sweep_cli stability_cli tune_cli",
     "bus_cli",
     "cli",
     "__main__",
@@ -76,7 +95,7 @@ ROWS = (
 BLOCKS = {
     "trajectories": ("motion_files", "motions", "trajectories"),
     "references": ("references",),
-    "estimators": ("estimators",),
+    "estimators": ("estimators", "forecast", "observers", "compensation"),
     "channels": ("delays", "channels"),
     "drives": ("drives",),
     "plant": ("plant",),
@@ -92,17 +111,31 @@ UPWARD = {
 # Where each library is known. NumPy and annotated_types (rules on numbers) may be used anywhere.
 LIBRARIES = {
     "mujoco": {"dynamics", "mjcf", "mjcf_checks", "plant", "assembly", "video"},
-    "scipy": {"estimators", "trajectories"},
+    "scipy": {
+        "estimators",
+        "stability.assist",
+        "stability.boundary",
+        "stability.jitter",
+        "stability.loops",
+        "stability.sampled",
+        "stability.tracking",
+        "sweep_design",
+        "sweep_search",
+        "trajectories",
+        "tuning",
+    },
     "pydantic": {"schema"},
     "pydantic_core": {"schema"},
     "yaml": {"yaml_text"},
     "h5py": {"record"},
-    "matplotlib": {"bus_plots", "drawing", "plots"},
+    "pyarrow": {"sweep_table"},
+    "distributed": {"sweep_cluster"},
+    "matplotlib": {"bus_plots", "drawing", "plots", "stability_map", "stability_plots", "sweep_plots"},
     "PIL": {"plots", "video"},
     "imageio": {"video"},
-    "jinja2": {"report"},
-    "typer": {"bus_cli", "cli", "console"},
-    "rich": {"bus_tables", "cli", "console"},
+    "jinja2": {"page"},
+    "typer": {"bus_cli", "cli", "console", "stability_cli", "sweep_cli", "tune_cli"},
+    "rich": {"bus_tables", "cli", "console", "stability_cli"},
 }
 ANYWHERE = {"numpy", "annotated_types"}
 BUS_ONLY = {"can", "canopen"}
@@ -230,7 +263,7 @@ def test_a_library_is_imported_where_the_table_says() -> None:
     assert {library: where for library, where in found.items() if library not in ANYWHERE} == LIBRARIES
 
 
-@pytest.mark.parametrize("library", ["scipy", "h5py", "imageio", "jinja2", "rich", "PIL"])
+@pytest.mark.parametrize("library", ["scipy", "h5py", "imageio", "jinja2", "rich", "PIL", "pyarrow", "distributed"])
 def test_what_is_slow_to_import_and_seldom_needed_is_imported_in_functions(library: str) -> None:
     for path in MODULES.values():
         for one in imports(path):
@@ -254,7 +287,7 @@ def test_nothing_is_printed_but_by_the_command_line() -> None:
     for module, path in MODULES.items():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("print", "input"):
-                assert module in ("cli", "bus_cli", "console")
+                assert module in ("cli", "stability_cli", "sweep_cli", "tune_cli", "bus_cli", "console")
 
 
 def test_no_name_means_two_things() -> None:

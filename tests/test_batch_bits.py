@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lwa4d_sim.errors import ScenarioError
 from lwa4d_sim.record import RunLog
 from lwa4d_sim.runner import run, run_batch
 from lwa4d_sim.scenario import Scenario
@@ -157,3 +158,58 @@ def test_same_seed_same_bits_other_seed_other_bits() -> None:
     check_same(run(made), run(made))
     other = Scenario.parse(made.text, overrides={"plant.seed": 6})
     assert not np.array_equal(run(made).q, run(other).q)
+
+
+TRANSPORTS: list[dict[str, Any]] = [
+    {"latency": 0.0},
+    {"latency": 0.0035},
+    {"latency": 0.012},
+    {"latency": 0.0007},
+]
+MIXED: list[dict[str, Any]] = [
+    *TRANSPORTS,
+    {"latency": [0.001, 0.009, 0.0]},
+    {"latency": 0.002, "jitter": 0.004},
+    {"latency": {"kind": "exponential", "minimum": 0.001, "tail": 0.004}, "loss": 0.3},
+    {"latency": {"kind": "trace", "values": [0.001, 0.015, 0.0]}, "loss": {"probability": 0.2, "mean_burst": 3.0}},
+    {"latency": {"kind": "uniform", "high": 0.02}, "per_joint": True, "loss": 0.1},
+    {"latency": {"kind": "normal", "mean": 0.004, "std": 0.002}, "per_joint": True},
+    {"position_resolution": 1e-4, "torque_resolution": 0.05},
+    {"position_resolution": [1e-3, 0.0, 1e-4]},
+]
+
+
+def transported(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    base = members("lwa4d_3dof", len(rows))
+    return [
+        {**one, **{f"loop.{key}": value for key, value in row.items()}} for one, row in zip(base, rows, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("actuation", ["immediate", "next_sync"])
+@pytest.mark.parametrize("phase", [None, 0.004])
+def test_members_of_one_batch_may_differ_in_constant_latency(actuation: str, phase: float | None) -> None:
+    loop = {"actuation": actuation, "phase": phase, "late_data": {"policy": "ramp", "timeout": 0.011}}
+    made = scenario("lwa4d_3dof", LAWS["pd_joint"], loop)
+    check(made, transported(TRANSPORTS * 2), alone=range(8))
+
+
+@pytest.mark.parametrize("velocity", ["filtered_derivative", "backward_difference", "kalman"])
+def test_members_of_one_batch_may_differ_in_measurement_latency(velocity: str) -> None:
+    loop = {"phase": 0.002, "velocity": {"kind": velocity}}
+    rows = [{"latency": {"measurement": up, "command": down}} for up in (0.0, 0.0015, 0.013) for down in (0.0, 0.004)]
+    check(scenario("lwa4d_3dof", LAWS["ct_joint"], loop), transported(rows), alone=range(6))
+
+
+def test_members_of_one_batch_may_differ_in_laws_loss_and_resolutions() -> None:
+    made = scenario("lwa4d_3dof", LAWS["pd_joint"], {"late_data": {"policy": "zero", "timeout": 0.015}})
+    check(made, transported(MIXED), alone=range(len(MIXED)))
+
+
+def test_members_with_another_phase_or_period_are_refused() -> None:
+    made = scenario("lwa4d_3dof", LAWS["pd_joint"], {})
+    with pytest.raises(ScenarioError, match=r"member 1 of the batch differs in 'loop\.phase'"):
+        list(run_batch(made, [{}, {"loop.latency": {"measurement": 0.003}}]))
+    with pytest.raises(ScenarioError, match="member 1 of the batch differs in 'loop'"):
+        list(run_batch(made, [{}, {"loop.period": 0.005}]))
+    list(run_batch(made, [{}, {"loop.latency": {"measurement": 0.01}}]))  # a whole period later: the same phase

@@ -7,12 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lwa4d_sim.channels import Gate, Transport
+from lwa4d_sim.channels import Gate, StaggeredChannel, Transport, build_channel
 from lwa4d_sim.delays import (
     ExponentialLatency,
+    Latency,
     LatencyDraws,
+    LatencyStream,
     Loss,
     LossDraws,
+    LossStream,
     NormalLatency,
     TraceLatency,
     UniformLatency,
@@ -31,7 +34,12 @@ def payload(k: int) -> tuple[Array, ...]:
 
 
 def build(transport: Transport, gate: Gate, n_sims: int = N, signal: int = 1, first_seed: int = 0) -> Channel:
-    return transport.build(range(first_seed, first_seed + n_sims), signal, JOINTS, gate)
+    seeds = range(first_seed, first_seed + n_sims)
+    return build_channel([transport] * n_sims, seeds, signal, JOINTS, gate)
+
+
+def draw(latency: Latency, jitter: float, sims: int) -> LatencyDraws:
+    return LatencyDraws([LatencyStream(latency, jitter, 1, np.random.SeedSequence(seed)) for seed in range(sims)])
 
 
 def stamps(arrived: Arrived | None) -> Array:
@@ -51,6 +59,10 @@ def same(a: Arrived | None, b: Arrived | None) -> None:
             np.testing.assert_array_equal(x[known], y[known])
 
 
+def staggered(latency: int, gate: Gate) -> Channel:
+    return StaggeredChannel([Ns(latency)] * N, gate)
+
+
 def direct(latency: int, gate: Gate) -> Channel:
     return build(Transport(latency=latency / 1e9), gate)
 
@@ -67,7 +79,7 @@ def replayed(latency: int, gate: Gate) -> Channel:
     return build(Transport(latency=TraceLatency(values=(latency / 1e9,))), gate)
 
 
-EVERY_KIND = pytest.mark.parametrize("make", [direct, drawn, listed, replayed])
+EVERY_KIND = pytest.mark.parametrize("make", [direct, staggered, drawn, listed, replayed])
 
 
 @EVERY_KIND
@@ -103,7 +115,7 @@ def test_battery_over_every_channel(make: Callable[[int, Gate], Channel]) -> Non
 @settings(max_examples=40, derandomize=True, deadline=None)
 def test_a_constant_law_is_the_plain_queue(latency: int, grid: int, sync: int, gaps: list[int], step: int) -> None:
     gate = Gate(grid, sync)
-    channels = [make(latency, gate) for make in (direct, drawn, listed, replayed)]
+    channels = [make(latency, gate) for make in (direct, staggered, drawn, listed, replayed)]
     sends = np.cumsum(gaps)
     k = 0
     for now in range(0, int(sends[-1]) + latency + 8 * MS, step):
@@ -126,8 +138,8 @@ def test_random_arrivals_against_brute_force(law: UniformLatency | ExponentialLa
     loss_seeds = [np.random.SeedSequence(seed, spawn_key=(1, 1)) for seed in range(N)]
     width = JOINTS if transport.per_joint else 1
     latency, loss = (
-        LatencyDraws(transport.latency, transport.jitter, width, seeds),
-        LossDraws(transport.loss, width, loss_seeds),
+        LatencyDraws([LatencyStream(transport.latency, transport.jitter, width, seed) for seed in seeds]),
+        LossDraws([LossStream(transport.loss, width, seed) for seed in loss_seeds]),
     )
     shape = (N, JOINTS)
     period, count = 10 * MS, 300
@@ -185,7 +197,7 @@ LOSSES = [Loss(probability=0.2), Loss(probability=0.7), Loss(probability=0.3, me
 @pytest.mark.parametrize("loss", LOSSES, ids=str)
 def test_loss_has_the_asked_share_and_burst_length(loss: Loss) -> None:
     sims, count = 40, 8000
-    draws = LossDraws(loss, 1, [np.random.SeedSequence(seed) for seed in range(sims)])
+    draws = LossDraws([LossStream(loss, 1, np.random.SeedSequence(seed)) for seed in range(sims)])
     lost = np.array([draws.next()[:, 0] for _ in range(count)]).T  # (sims, count)
     p, leave = loss.probability, loss.leave
     mean_burst = loss.mean_burst or 1.0 / (1.0 - p)
@@ -222,7 +234,7 @@ def test_per_joint_draws_joint_by_joint(per_joint: bool) -> None:
     ],
 )
 def test_laws_have_their_moments(law: UniformLatency | NormalLatency | ExponentialLatency) -> None:
-    draws = LatencyDraws(law, 0.0, 1, [np.random.SeedSequence(seed) for seed in range(20)])
+    draws = draw(law, 0.0, 20)
     seconds = np.array([draws.next() for _ in range(2000)]) / 1e9
     mean, std = {
         "uniform": (0.0055, 0.007 / np.sqrt(12)), "normal": (0.005, 0.001), "exponential": (0.005, 0.002)
@@ -235,11 +247,9 @@ def test_laws_have_their_moments(law: UniformLatency | NormalLatency | Exponenti
 
 def test_jitter_is_added_and_a_trace_is_replayed() -> None:
     trace = TraceLatency(values=(0.001, 0.004, 0.002))
-    seeds = [np.random.SeedSequence(seed) for seed in range(2)]
-    plain = LatencyDraws(trace, 0.0, 1, seeds)
+    plain = draw(trace, 0.0, 2)
     assert [plain.next().ravel().tolist() for _ in range(4)] == [[MS, MS], [4 * MS] * 2, [2 * MS] * 2, [MS, MS]]
-    plain = LatencyDraws(trace, 0.0, 1, seeds)
-    shaken = LatencyDraws(trace, 0.003, 1, seeds)
+    plain, shaken = draw(trace, 0.0, 2), draw(trace, 0.003, 2)
     extra = np.array([shaken.next() - plain.next() for _ in range(900)]) / 1e9
     assert 0 <= extra.min() < 1e-4
     assert 0.0029 < extra.max() <= 0.003
@@ -250,7 +260,7 @@ def test_streams_depend_on_seed_and_signal_alone() -> None:
     transport = Transport(latency=UniformLatency(high=0.02), loss=Loss(probability=0.2), per_joint=True)
 
     def history(n_sims: int, signal: int, first_seed: int) -> Array:
-        channel = transport.build(range(first_seed, first_seed + n_sims), signal, JOINTS, Gate(1))
+        channel = build(transport, Gate(1), n_sims, signal, first_seed)
         found = []
         for k in range(700):  # more than one block of draws
             channel.send(Ns(k * 10 * MS), (np.full((n_sims, JOINTS), float(k)),))

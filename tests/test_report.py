@@ -14,9 +14,10 @@ from lwa4d_sim.drawing import Picture
 from lwa4d_sim.errors import RecordError
 from lwa4d_sim.expect import Outcome, evaluate
 from lwa4d_sim.metrics import METRICS
+from lwa4d_sim.page import NONE, number
 from lwa4d_sim.plots import draw_all
 from lwa4d_sim.record import RunLog
-from lwa4d_sim.report import NONE, Section, bound, number, section_from_folder, write_report
+from lwa4d_sim.report import Section, bound, section_from_folder, write_report
 from lwa4d_sim.verdict import Run, headline, remarks
 
 _RULES: dict[str, dict[str, Any]] = {"ideal": {"stable": True}, "can": {"stable": True, "final_error_max": [0.1, None]}}
