@@ -10,7 +10,7 @@ LwaError
 ├── TrajectoryError (ValueError)  a motion that cannot be built from what was asked
 ├── RecordError (OSError)         a record cannot be written or read
 ├── BusError (OSError)            a bus, a node on it, or what it said, is not as it must be
-└── SweepError                    a sweep cannot go on: its folder is another sweep's, it is too large, a cluster is gone
+└── SweepError (ValueError)       a sweep cannot go on: another sweep's folder, too many runs, a cluster that is gone
 """
 
 
@@ -63,5 +63,5 @@ class BusError(LwaError, OSError):
     """A bus, a node on it, or what it said, is not as it must be."""
 
 
-class SweepError(LwaError):
+class SweepError(LwaError, ValueError):
     """A sweep cannot be started or cannot go on; what it has is kept."""

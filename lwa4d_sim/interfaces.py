@@ -81,8 +81,8 @@ class TaskReference(NamedTuple):
 class Measurement(NamedTuple):
     """What the drives latched: ``q`` (N, n) [rad] and, when a drive estimates it, ``dq`` (N, n) [rad/s].
 
-    ``stamp`` [ns], (N, n), (N, 1) or (1, 1), is the instant each joint was sampled; joints may differ in age. A joint that has
-    never been heard of has stamp -1.
+    ``stamp`` [ns], (N, n), (N, 1) or (1, 1), is the instant each joint was sampled; joints may differ in age. A joint
+    that has never been heard of has stamp -1.
     """
 
     stamp: IntArray
@@ -94,8 +94,8 @@ class Arrived(NamedTuple):
     """The newest data at an instant, joint by joint.
 
     Attributes:
-        stamp: when each joint's datum was made [ns], (N, n), or (N, 1) or (1, 1) where joints or all are alike; -1 where
-            none has arrived.
+        stamp: when each joint's datum was made [ns], (N, n), or (N, 1) or (1, 1) where joints or all are alike; -1
+            where none has arrived.
         since: when it arrived [ns], shaped likewise.
         values: the data, each (N, n).
     """

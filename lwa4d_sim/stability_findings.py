@@ -22,8 +22,10 @@ from lwa4d_sim.stability.analysis import (
 )
 from lwa4d_sim.stability.maps import Slice, default_joints, workspace
 from lwa4d_sim.stability.motion import Course, along
-from lwa4d_sim.stability.study import Points, Study
+from lwa4d_sim.stability.points import Points
+from lwa4d_sim.stability.study import Study
 
+STILL = 1e-9  # [-] beyond 1 that a spectral radius may be by the rounding of numeric slopes (derived)
 _DRAWN = 12  # operating points whose curves a chart can hold (assumed: what an eye can tell apart)
 
 
@@ -37,6 +39,7 @@ class Charts:
         poles: eigenvalues of the loop from tick to tick, (K, m); None without a bus.
         course: along the motion.
         map: over a slice of the workspace; None for an arm of one joint.
+        map_stable: whether the loop is stable in each pose of the map.
         alike: whether each operating point's joints that the slice leaves alone stand as on the map, the one about
             the vertical aside.
     """
@@ -47,6 +50,7 @@ class Charts:
     poles: Any
     course: Course
     map: Slice | None
+    map_stable: Any
     alike: Sequence[bool]
 
 
@@ -116,13 +120,15 @@ def with_charts(
     rows = sorted({*np.linspace(0, len(points.q) - 1, min(_DRAWN, len(points.q))).round().astype(int).tolist()})
     some = Points(points.t[rows], points.q[rows], points.dq[rows], points.ddq[rows], _part(points.ref, rows))
     pair = check_joints(study, joints)
+    one = None if pair is None else workspace(study, pair, (size, size), advance)
     charts = Charts(
         rows=rows,
         latency=None if study.ideal else over_latency(study, some),
         period=None if study.ideal else over_period(study, some),
         poles=None if study.ideal else np.linalg.eigvals(study.close(study.linear(some)).at_gain(np.ones(len(rows)))),
         course=along(study),
-        map=None if pair is None else workspace(study, pair, (size, size), advance),
+        map=one,
+        map_stable=np.ones(0, bool) if one is None else one.spectral_radius <= 1.0 + STILL,
         alike=[pair is not None and _alike(study, q, pair) for q in points.q],
     )
     return Findings(study, found.points, found.names, found.remarks, found.poses, charts)

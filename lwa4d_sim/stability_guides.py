@@ -7,7 +7,8 @@ LATENCY = (
     "belongs to a point where the loop is unstable as it is. Filled marks: the delay margin, where a curve falls "
     "through the line. Hollow marks: the jitter margin, up to which the delay may even vary from command to "
     "command. To do: where the latency you expect lies to the right of a mark, multiply all gains by less than the "
-    "height of the lowest curve at that latency. A step in a curve is a SYNC missed."
+    "height of the lowest curve at that latency. A step in a curve is a SYNC missed. Where gravity compensation "
+    "comes late, gains far below a curve may be too weak to hold an upright arm; the verdict says so if these are."
 )
 PERIOD = (
     "The same factor on all gains, over the control period; latencies and filters stay as they are. The dotted line"
@@ -48,7 +49,8 @@ MAP = (
     "Joints {a} and {b} go through their ranges (joint {b} on one side of zero), the others stand as at the first "
     "operating point of the scenario; the arm is at rest in each pose. It is drawn {place}. Left: the factor on all"
     " gains at which the loop becomes unstable; blue is reserve, red is unstable, the black line, if there is one, "
-    "is the border. Right: which joint swings most at that limit. Filled circles are operating points that lie on "
-    "the map. Hollow ones have the tool there with other joints standing differently, so the colours do not hold "
-    "for them. What to do: keep the work in the blue, or choose gains for the reddest pose that the task visits."
+    "is the border (where gains are too weak rather than too strong, the red shows by how much). Right: which joint"
+    " swings most at that limit. Filled circles are operating points that lie on the map. Hollow ones have the tool"
+    " there with other joints standing differently, so the colours do not hold for them. What to do: keep the work "
+    "in the blue, or choose gains for the reddest pose that the task visits."
 )

@@ -54,7 +54,7 @@ def draw_map(found: Findings, charts: Charts, one: Slice, folder: Path) -> Pictu
     with matplotlib.style.context(LOOK):
         figure = canvas(found, title, 5.4)
         left, right = figure.subplots(1, 2, sharex=True, sharey=True)
-        _margins(figure, (left, right), plane, one)
+        _margins(figure, (left, right), plane, charts, one)
         shown = _limiting(right, plane, one)
         for ax in (left, right):
             _points(ax, plane, found, charts)
@@ -91,17 +91,18 @@ def plane_of(found: Findings, one: Slice) -> Plane:
     return Plane(x, y, at, (f"joint {a + 1} [°]", f"joint {b + 1} [°]"), False)
 
 
-def _margins(figure: Figure, axes: tuple[Axes, Axes], plane: Plane, one: Slice) -> None:
+def _margins(figure: Figure, axes: tuple[Axes, Axes], plane: Plane, charts: Charts, one: Slice) -> None:
     span, margin = _WIDEST, np.clip(one.gain_margin, 1e-3, 1e3)
-    logs = np.log(margin)
+    too_weak = ~charts.map_stable & (margin > 1.0)  # red as well: there the factor is the least that is needed
+    logs = np.log(np.where(too_weak, 1.0 / margin, margin))
     cells = np.exp(0.25 * (logs[1:, 1:] + logs[:-1, 1:] + logs[1:, :-1] + logs[:-1, :-1]))
     ax = axes[0]
     colours = matplotlib.colormaps["RdBu"]
     mesh = ax.pcolormesh(
         plane.x, plane.y, cells, cmap=colours, norm=LogNorm(1 / span, span), shading="flat", rasterized=True
     )
-    if margin.min() < 1.0 < margin.max():
-        ax.contour(plane.x, plane.y, margin, levels=[1.0], colors=[BLACK], linewidths=1.4)
+    if logs.min() < 0.0 < logs.max():
+        ax.contour(plane.x, plane.y, logs, levels=[0.0], colors=[BLACK], linewidths=1.4)
     bar = figure.colorbar(mesh, ax=list(axes), location="bottom", shrink=0.55, pad=0.03, extend="both")
     bar.ax.xaxis.set_major_locator(FixedLocator(_TICKS))
     bar.ax.xaxis.set_minor_locator(NullLocator())

@@ -151,12 +151,18 @@ def _legend(figure: Figure, marks: Sequence[Marked], extra: Sequence[Any], *, li
             Patch(color=SAFE, label="stable at every point"),
         ]
     handles += extra
-    figure.legend(handles=handles, loc="outside lower left", ncols=4 if line else 6, fontsize=SMALL, handlelength=1.8)
+    figure.legend(
+        handles=handles,
+        loc="outside lower left",
+        ncols=6 if len(marks) <= 4 and not line else 4,
+        fontsize=SMALL,
+        handlelength=1.8,
+    )
 
 
 def _poles(found: Findings, charts: Charts, poles: Any) -> tuple[str, str, str, Figure]:
     title = "Eigenvalues of the loop"
-    figure = canvas(found, title, 4.9)
+    figure = canvas(found, title, 4.6)
     whole, near = figure.subplots(1, 2)
     circle = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 721))
     lead = [_swinging(values) for values in poles]

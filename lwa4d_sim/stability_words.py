@@ -6,9 +6,8 @@ import numpy as np
 
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.stability.analysis import PointStability
-from lwa4d_sim.stability_findings import Findings
+from lwa4d_sim.stability_findings import STILL, Findings
 
-STILL = 1e-9  # [-] beyond 1 that a spectral radius may be by the rounding of numeric slopes
 _NAMED = 0.5  # a joint that moves at least this share of the largest is named (assumed)
 
 
@@ -22,7 +21,7 @@ def headline(found: Findings) -> str:
     bad = [k for k, point in enumerate(found.points) if unstable(point)]
     if not bad:
         return _stable(found)
-    worst = max(bad, key=lambda k: (-found.points[k].gain_margin, found.points[k].spectral_radius))
+    worst = max(bad, key=lambda k: found.points[k].spectral_radius)
     names = _joined([found.names[k] for k in bad])
     if len(bad) == len(found.points) > 1:
         head = "The loop is unstable everywhere looked at, worst"
@@ -36,7 +35,9 @@ def headline(found: Findings) -> str:
 def _worst(found: Findings, k: int) -> str:
     point = found.points[k]
     if point.gain_margin == 0:
-        return f"{_grows(point)}, and no smaller gains of this kind help."
+        return f"{_grows(point)}, and no factor on the gains helps."
+    if point.gain_margin > 1:
+        return f"{_grows(point)}. These gains are too weak: it takes {factor(point.gain_margin)} times as much."
     shakes = f"{moves(point.mode.share)} at {point.mode.frequency:.1f} Hz"
     return f"{_grows(point)}. The limit there is {factor(point.gain_margin)} times these gains, where {shakes}."
 
@@ -79,7 +80,11 @@ def details(found: Findings) -> list[str]:
         return out
     course = found.charts.course
     t, margin = course.t[course.worst], course.gain_margin[course.worst]
-    if np.isfinite(margin):
+    if np.isfinite(margin) and margin > 1 and course.spectral_radius[course.worst] > 1 + STILL:
+        out.append(
+            f"Along the motion these gains are too weak at {t:.2f} s: it takes {factor(float(margin))} times as much."
+        )
+    elif np.isfinite(margin):
         out.append(
             f"Along the motion the gains are nearest to their limit at {t:.2f} s: there it is {factor(float(margin))} "
             "times these gains."
@@ -92,12 +97,14 @@ def details(found: Findings) -> list[str]:
         )
     if found.charts.map is not None:
         margins = found.charts.map.gain_margin
-        part = f"{100 * (margins > 1).mean():.0f} %"
+        part = f"{100 * found.charts.map_stable.mean():.0f} %"
         text = f"In the slice of the workspace on the map these gains are stable in {part} of the poses"
         least = float(margins.min())
-        limit = (
-            "no gains are too large" if np.isinf(least) else f"the smallest limit is {factor(least)} times these gains"
-        )
+        limit = f"the smallest limit is {factor(least)} times these gains"
+        if np.isinf(least):
+            limit = "no gains are too large"
+        elif least == 0:
+            limit = "in some no factor on the gains helps"
         out.append(f"{text}; {limit}.")
     return out
 

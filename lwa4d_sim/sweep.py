@@ -89,8 +89,12 @@ class Folder:
 
     def _put(self, name: str, text: str) -> None:
         partial = self.path / f"{name}.part"
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, self.path / name)
+        try:
+            partial.write_text(text, encoding="utf-8")
+            os.replace(partial, self.path / name)
+        except OSError:
+            partial.unlink(missing_ok=True)
+            raise
 
     @property
     def table(self) -> Path:

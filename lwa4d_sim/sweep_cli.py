@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lwa4d_sim.console import Json, Out, progress, shipped_scenarios
+from lwa4d_sim.console import Json, Out, busy, progress, shipped_scenarios
 
 
 def sweep(
@@ -69,8 +69,10 @@ def sweep(
     summary: dict[str, Any] = summarise(made, folder)
     if not no_plots:
         from lwa4d_sim.sweep_report import report
+        from lwa4d_sim.sweep_theory import stability_limit
 
-        summary["report"] = str(report(made, folder, summary))
+        with busy("drawing", quiet=as_json):
+            summary["report"] = str(report(made, folder, summary, stability_limit(made)))
     if as_json:
         print(json.dumps(summary))
     else:

@@ -33,12 +33,14 @@ class Runs(NamedTuple):
         axes: values of each axis by name, numbers (R,) [SI] or lists of text.
         stable: which runs are stable, (R,).
         metrics: by column (R,), NaN where there is none.
+        log: axes to be drawn on a logarithmic scale.
     """
 
     name: str
     axes: Mapping[str, Any]
     stable: Any
     metrics: Mapping[str, Array]
+    log: frozenset[str] = frozenset()
 
     def worst(self, metric: str) -> Array | None:
         """A metric, of several columns the largest; None where no run has it."""
@@ -88,33 +90,23 @@ def _maps(runs: Runs, boundary: Curve | None) -> _Made:
         f"{read}Blue is stable, orange is not. A ragged edge means that the limit hangs on details: read it as a band."
         f"{line}"
     )
-    yield (
-        "map_stable",
-        "Stable or not",
-        text,
-        draw_heat_map(
-            runs.name, (x_name, x), (y_name, y), ("stable", np.where(runs.stable, 1.0, 0.0)), boundary=boundary
-        ),
-    )
+
+    def drawn(label: str, z: Array) -> Figure:
+        return draw_heat_map(runs.name, (x_name, x), (y_name, y), (label, z), boundary=boundary, log=runs.log)
+
+    yield "map_stable", "Stable or not", text, drawn("stable", np.where(runs.stable, 1.0, 0.0))
     for metric in MAPPED:
         values = runs.worst(metric)
-        if values is not None:
-            unit, meaning = METRICS[metric]
-            text = (
-                f"{read}Colour is {meaning} [{unit}], on a logarithmic scale; runs that are not stable are left white. "
-                "Look for a valley, and how wide it is: a good choice lies where its neighbours are good as well."
-                f"{line}"
-            )
-            shown = np.where(runs.stable, values, np.nan)
-            if np.isfinite(shown).any():
-                yield (
-                    f"map_{metric}",
-                    f"Map of {metric}",
-                    text,
-                    draw_heat_map(
-                        runs.name, (x_name, x), (y_name, y), (f"{metric} [{unit}]", shown), boundary=boundary
-                    ),
-                )
+        if values is None or not np.isfinite(values[runs.stable]).any():
+            continue
+        unit, meaning = METRICS[metric]
+        text = (
+            f"{read}Colour is {meaning} [{unit}], dark is bad; runs that are not stable are left white. Look for a "
+            "bright valley, and how wide it is: a good choice lies where its neighbours are good as well."
+            f"{line}"
+        )
+        shown = np.where(runs.stable, values, np.nan)
+        yield f"map_{metric}", f"Map of {metric}", text, drawn(f"{metric} [{unit}]", shown)
 
 
 def draw_heat_map(
@@ -124,6 +116,7 @@ def draw_heat_map(
     z: tuple[str, Array],
     *,
     boundary: Curve | None = None,
+    log: frozenset[str] = frozenset(),
 ) -> Figure:
     """A map of a number over two axes; white where there is none.
 
@@ -133,6 +126,7 @@ def draw_heat_map(
         y: of the vertical one.
         z: label and values (R,); of several at one place the worst counts. `stable` (1 or 0) gets two colours.
         boundary: points (x, y) of a curve to be drawn over the map.
+        log: labels of the axes that have a logarithmic scale.
     """
     columns, at_x = np.unique(x[1], return_inverse=True)
     rows, at_y = np.unique(y[1], return_inverse=True)
@@ -148,13 +142,15 @@ def draw_heat_map(
     colours: Any = ListedColormap([BAD, GOOD])
     if not flag:
         positive = known[known > 0]
-        log = positive.size == known.size and known.max() > 3 * known.min()
+        wide = positive.size == known.size and known.max() > 3 * known.min()
         norm = (
-            LogNorm(known.min(), known.max()) if log else Normalize(known.min(), max(known.max(), known.min() + 1e-12))
+            LogNorm(known.min(), known.max()) if wide else Normalize(known.min(), max(known.max(), known.min() + 1e-12))
         )
         colours = "viridis_r"
-    mesh = ax.pcolormesh(_edges(columns), _edges(rows), cells, cmap=colours, norm=norm)
+    x_log, y_log = x[0] in log, y[0] in log
+    mesh = ax.pcolormesh(_edges(columns, x_log), _edges(rows, y_log), cells, cmap=colours, norm=norm)
     ax.set(xlabel=plain(x[0]), ylabel=plain(y[0]))
+    ax.set(xscale="log" if x_log else "linear", yscale="log" if y_log else "linear")
     ax.grid(visible=False)
     if flag:
         ax.text(1, 1.01, "stable", color=GOOD, ha="right", va="bottom", transform=ax.transAxes, weight="bold")
@@ -168,8 +164,11 @@ def draw_heat_map(
     return figure
 
 
-def _edges(centres: Array) -> Array:
-    """Borders of cells around sorted centres."""
+def _edges(centres: Array, log: bool) -> Array:
+    """Borders of cells around sorted centres, at their middles (of the logarithms, on such a scale)."""
+    if log:
+        edges: Array = np.exp(_edges(np.log(centres), False))
+        return edges
     middles = 0.5 * (centres[1:] + centres[:-1])
     return np.concatenate([[2 * centres[0] - middles[0]], middles, [2 * centres[-1] - middles[-1]]])
 
@@ -250,15 +249,20 @@ def _parallel(runs: Runs) -> _Made:
         return
     columns = {**axes, "max_error [m]": np.where(runs.stable, error, np.nan)}
     figure = canvas("All runs, axis by axis", runs.name, 4.8)
-    ax = figure.add_axes((0.05, 0.17, 0.9, 0.68))
+    ax = figure.add_axes((0.08, 0.19, 0.84, 0.66))
     scaled = []
     for k, (name, values) in enumerate(columns.items()):
         low, high = np.nanmin(values, initial=np.inf), np.nanmax(values, initial=-np.inf)
         if not np.isfinite(low):
             return
-        scaled.append((values - low) / (high - low) if high > low else np.full(len(values), 0.5))
+        if name in runs.log:
+            shown, ends = np.log(values), np.log([low, high])
+        else:
+            shown, ends = values, np.array([low, high])
+        scaled.append((shown - ends[0]) / np.ptp(ends) if high > low else np.full(len(values), 0.5))
         ax.text(k, 1.03, f"{high:.3g}", ha="center", va="bottom", fontsize=SMALL, color=GREY)
-        ax.text(k, -0.03, f"{low:.3g}\n{plain(name)}", ha="center", va="top", fontsize=SMALL)
+        down = "\n" * (1 + k % 2)  # on two lines by turns, for names are long
+        ax.text(k, -0.03, f"{low:.3g}{down}{plain(name)}", ha="center", va="top", fontsize=SMALL)
         ax.axvline(k, color=GREY, lw=0.8)
     lines = np.stack(scaled, axis=1)
     lines[~runs.stable, -1] = 1.0

@@ -14,7 +14,7 @@ from lwa4d_sim.metrics import FLAGS, METRICS
 from lwa4d_sim.page import write_page
 from lwa4d_sim.results import run_scenario
 from lwa4d_sim.sweep import WORST, Folder
-from lwa4d_sim.sweep_design import WorstCase
+from lwa4d_sim.sweep_design import RangeAxis, WorstCase
 from lwa4d_sim.sweep_file import Sweep
 from lwa4d_sim.sweep_plots import Curve, Runs, draw_sweep
 from lwa4d_sim.sweep_table import made, metric_of, read
@@ -75,7 +75,8 @@ def _runs(sweep: Sweep, folder: Folder) -> Runs:
         axes[name] = np.asarray(values, float) if plain else [str(value) for value in values]
     own = [c for c in table.column_names if metric_of(c) in METRICS and c not in FLAGS and c not in axes]
     metrics = {name: np.array(table[name].to_numpy(zero_copy_only=False), float) for name in own}
-    return Runs(sweep.name, axes, np.array(table["stable"].to_pylist(), bool), metrics)
+    log = frozenset(name for name, axis in sweep.axes.items() if isinstance(axis, RangeAxis) and axis.scale == "log")
+    return Runs(sweep.name, axes, np.array(table["stable"].to_pylist(), bool), metrics, log)
 
 
 def _percentiles(runs: Runs) -> list[tuple[str, str, list[float]]]:

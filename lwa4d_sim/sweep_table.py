@@ -22,7 +22,7 @@ def part(points: Sequence[Point], rows: Sequence[Row]) -> Any:
     Lists are opened into columns: final_error becomes final_error_1, final_error_2, ... (segments or joints from 1).
     """
     opened = [_flat(row) for row in rows]
-    names = _ordered({key for row in opened for key in row} - {"run", *_OUTCOME})
+    names = _ordered({"stable", *(key for row in opened for key in row)} - {"run", *_OUTCOME})
     columns = {name: _column(name, [row.get(name) for row in opened]) for name in ("run", *names, *_OUTCOME)}
     return _joined(columns, points)
 

@@ -10,6 +10,11 @@ from lwa4d_sim.batch import deaf
 from lwa4d_sim.errors import SweepError
 from lwa4d_sim.sweep_work import Answer, Task, work
 
+_STILLBORN = 3  # processes in a row that end before they begin
+_CANNOT_START = (
+    "worker processes end as soon as they start; a script of your own must call this under if __name__ == '__main__'"
+)
+
 
 class Done(NamedTuple):
     """What became of a task: its ticket, and its answer, or None where the worker died."""
@@ -59,6 +64,7 @@ class Processes:
         self._size = size
         self._idle: list[_Process] = []
         self._busy: dict[_Process, int] = {}
+        self._stillborn = 0
 
     @property
     def size(self) -> int:
@@ -74,21 +80,32 @@ class Processes:
         self._busy[process] = ticket
 
     def finished(self) -> list[Done]:
-        ready = set(wait([process.pipe for process in self._busy]))
-        done = []
-        for process in [process for process in self._busy if process.pipe in ready]:
-            ticket = self._busy.pop(process)
-            try:
-                answer = process.receive()
-            except (EOFError, OSError):  # a killed process closes its end
-                process.end()
-                done.append(Done(ticket, None))
-                continue
-            self._idle.append(process)
-            if isinstance(answer, SweepError):
-                raise answer
-            done.append(Done(ticket, answer))
+        done: list[Done] = []
+        while not done:
+            ready = set(wait([process.pipe for process in self._busy]))
+            for process in [process for process in self._busy if process.pipe in ready]:
+                self._hear(process, done)
         return done
+
+    def _hear(self, process: "_Process", done: list[Done]) -> None:
+        """Take what a process says; its death is a word as well."""
+        try:
+            answer = process.pipe.recv()
+        except (EOFError, OSError):  # a killed process closes its end
+            self._stillborn += not process.began
+            done.append(Done(self._busy.pop(process), None))
+            process.end()
+            if self._stillborn == _STILLBORN:
+                raise SweepError(_CANNOT_START) from None
+            return
+        if not process.began:
+            process.began, self._stillborn = True, 0
+            return
+        self._idle.append(process)
+        ticket = self._busy.pop(process)
+        if isinstance(answer, SweepError):
+            raise answer
+        done.append(Done(ticket, answer))
 
     def __enter__(self) -> "Processes":
         return self
@@ -109,17 +126,15 @@ class _Process:
         # spawned, because a forked copy of a process with running threads may hang
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
+        self.began = False
         self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
         with deaf():
             self._process.start()
         theirs.close()  # so that its death closes the pipe
 
     def send(self, task: Task) -> None:
-        with suppress(OSError):  # it died while idle; `receive` finds the pipe closed
+        with suppress(OSError):  # it died while idle, which is heard of soon enough
             self.pipe.send(task)
-
-    def receive(self) -> Any:
-        return self.pipe.recv()
 
     def end(self) -> None:
         self._process.kill()
@@ -130,6 +145,7 @@ class _Process:
 def _serve(pipe: "Connection[Any, Any]") -> None:
     """Work until the other end is closed, which the death of the other process does as well."""
     try:
+        pipe.send("began")
         while True:
             task = pipe.recv()
             try:

@@ -63,7 +63,7 @@ def tune(
     from lwa4d_sim.tuning import Wish, tune
 
     _require("--gain-margin", gain_margin, 1.0, 1000.0)
-    _require("--delay-margin", delay_margin, 0.0, 1.0)
+    _require("--delay-margin", delay_margin, 0.0, 0.1)
     _require("--peak", peak, 1.0, 100.0)
     scenario = Scenario.load(scenario_path(file), dict(override(text) for text in overrides or []))
     name = default_variant(scenario, variant)

@@ -1,7 +1,7 @@
 """The best gains under stated margins: the fastest loop, or the least error, that keeps them at every pose."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -13,7 +13,8 @@ from lwa4d_sim.interfaces import Array
 from lwa4d_sim.runner import run
 from lwa4d_sim.scenario import Scenario
 from lwa4d_sim.stability.maps import default_joints, slice_of
-from lwa4d_sim.stability.study import Points, Study
+from lwa4d_sim.stability.points import Points
+from lwa4d_sim.stability.study import Study
 from lwa4d_sim.stability.tracking import Tracking, tracking
 
 Gains = Literal["one", "two", "joints"]
@@ -112,10 +113,7 @@ class _Search:
         return study.resting(q.reshape(-1, study.n))
 
     def run(self) -> Tuned:
-        start = self._start()
-        # of one gain the largest is the fastest
-        simple = self._wish.gains == "one" and self._wish.objective == "bandwidth"
-        found = start if simple else self._improved(start)
+        found = self._best_gains()
         study = self._tried(found)
         linear = study.linear(self._points)
         return Tuned(
@@ -127,18 +125,30 @@ class _Search:
             evaluations=self._evaluations,
         )
 
+    def _best_gains(self) -> Array:
+        start = self._start()
+        if self._wish.gains == "one" and self._wish.objective == "bandwidth":
+            return start  # of one gain the largest is the fastest
+        if self._wish.gains == "joints":  # no worse than with two gains, then
+            fewer = _Search(self._study, replace(self._wish, gains="two"), self._advance)
+            two = np.repeat(fewer._best_gains(), len(self._kp))
+            self._evaluations += fewer._evaluations
+            if self._excess(start) > 0 or (self._excess(two) <= 0 and self._cost(two) < self._cost(start)):
+                start = two
+        return self._improved(start)
+
     def _start(self) -> Array:
         """The largest common factor that keeps the margins, never mind the peak."""
         low, high = np.log(_RANGE)
         steps = np.arange(high, low, -_STEP).tolist()
-        kept = next((s for s in steps if self._beyond_margins(self._ray(s)) <= 0), None)
+        kept = next((s for s in steps if self._beyond_margins(self._ray(s), roughly=True) <= 0), None)
         if kept is None:
             asked = f"a gain margin of {self._wish.gain_margin:g} and {1e3 * self._wish.delay_margin:g} ms more delay"
             raise ScenarioError(f"{self._study.scenario.source}: no factor on these gains bears {asked} at every pose")
         good, bad = kept, kept + _STEP
         while bad - good > 1e-6:
             middle = 0.5 * (good + bad)
-            good, bad = (middle, bad) if self._beyond_margins(self._ray(middle)) <= 0 else (good, middle)
+            good, bad = (middle, bad) if self._beyond_margins(self._ray(middle), roughly=True) <= 0 else (good, middle)
         return self._ray(good)
 
     def _ray(self, s: float) -> Array:
@@ -205,18 +215,22 @@ class _Search:
             self._trackings = {key: self._tracking(self._tried(x))}
         return self._trackings[key]
 
-    def _beyond_margins(self, x: Array) -> float:
+    def _beyond_margins(self, x: Array, *, roughly: bool = False) -> float:
+        """The logarithm of the largest spectral radius; ``roughly``: or of the first that is too large."""
         study, wish = self._tried(x), self._wish
         linear = study.linear(self._points)
         rows = np.arange(len(self._points.q))
-        plain = study.close(linear)
-        worst = max(
-            float(plain.radius(rows, np.full(len(rows), 1.0 + share * (wish.gain_margin - 1.0))).max())
-            for share in _SHARES
-        )
-        if wish.delay_margin and not study.ideal:
-            delays = [study.close(linear, share * wish.delay_margin) for share in _SHARES[1:]]
-            worst = max(worst, *(float(loop.radius(rows, np.ones(len(rows))).max()) for loop in delays))
+        plain, worst = study.close(linear), 0.0
+        for share in _SHARES:
+            factors = np.full(len(rows), 1.0 + share * (wish.gain_margin - 1.0))
+            worst = max(worst, float(plain.radius(rows, factors).max()))
+            if roughly and worst > 1.0:
+                return worst - 1.0
+        for share in _SHARES[1:] if wish.delay_margin and not study.ideal else ():
+            late = study.close(linear, share * wish.delay_margin)
+            worst = max(worst, float(late.radius(rows, np.ones(len(rows))).max()))
+            if roughly and worst > 1.0:
+                return worst - 1.0
         return float(np.log(min(worst, 1e6)))
 
     def _tracking(self, study: Study) -> Tracking:

@@ -7,6 +7,7 @@ import numpy as np
 
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.metrics import vibrating
+from lwa4d_sim.observers import ObserverVelocity
 from lwa4d_sim.runner import run_batch
 from lwa4d_sim.scenario import Scenario
 from lwa4d_sim.stability.filters import filter_of
@@ -18,7 +19,8 @@ RATIO = 5.0 / 3.0  # kd over kp of the thesis
 PERIOD, STEP = 0.01, 0.0025  # [s]; RK4 is exact enough: the limits differ by 1e-6 from those at 1 ms
 NUDGE = 2e-6  # [rad] so small that what is not linear stays below a thousandth, and large against rounding
 LENGTH = 5.0  # [s] of a simulation
-OFF = 0.03  # how far from the limit a simulation is to show it
+OFF = 0.03  # how far from the limit a simulation is to show it; nearer where it would grow out of what is linear:
+SLOW = 0.006  # largest growth per period, 20-fold over a simulation
 APART = 200  # periods between the two windows that are compared
 
 TEXT = """
@@ -117,19 +119,28 @@ def predicted(study: Study, rows: Sequence[int], factors: Sequence[float], extra
     The arm begins at rest, everything that estimators and drives remember is that rest, and the commands on their way
     are what holds the arm there: until the first command acts the brakes are closed.
     """
-    loop: Any = study.close(study.linear(study.waypoints()), extra)
+    linear = study.linear(study.waypoints())
+    loop: Any = study.close(linear, extra)
     how: Any = study.settings.loop
-    n, at, k = study.n, list(rows), np.asarray(factors)[:, None, None]
-    estimator, instants = filter_of(how.velocity, PERIOD), instants_of(how, n, extra=extra)
-    old = int(instants.old.max())
-    rest = np.array([1.0, 0.0])  # q and v of each joint, as a share of the nudge
-    held = np.linalg.solve(np.eye(len(estimator.A)) - estimator.A, estimator.B @ rest)
-    parts = [rest, [1.0, 1.0] if estimator.time_constant else [], held, *[rest] * old]
-    known = np.concatenate([np.asarray(part) for part in parts])
-    matrix = loop.F[at] + loop.G[at] @ (loop.U0[at] + k * loop.U1[at])
+    assist = study.settings.compensation
+    n, at, k = study.n, np.asarray(rows), np.asarray(factors, float)
+    old = int(instants_of(how, n, extra=extra).old.max())
+    rest = [1.0, 0.0]  # q and dq of each joint, as shares of the nudge
+    parts = [rest]
+    if isinstance(how.velocity, ObserverVelocity):
+        parts.append(rest)
+    else:
+        estimator = filter_of(how.velocity, PERIOD)
+        parts.append([1.0, 1.0] if estimator.time_constant else [])
+        parts.append(np.linalg.solve(np.eye(len(estimator.A)) - estimator.A, estimator.B @ rest).tolist())
+    parts += [rest] * old
+    if assist is not None and assist.disturbance_observer is not None:
+        parts.append([0.0, *rest])
+    known = np.concatenate(parts)
+    matrix = loop.F[at] + loop.G[at] @ loop.U(at, k)
     X = np.zeros(matrix.shape[:2])
     X[:, : n * len(known)] = np.kron(known, nudge(n))
-    hold = (loop.U0[at] @ X[..., None])[..., 0]
+    hold = linear.bare[at][:, :, :n] @ nudge(n)
     X[:, n * len(known) :] = np.tile(hold, X.shape[1] // n - len(known))
     motion = [X[:, : 2 * n]] * old  # until the first sample has arrived
     while len(motion) < round(LENGTH / PERIOD):
@@ -153,15 +164,18 @@ def growth(motion: Array) -> float:
     return float((after[worst] / before[worst]) ** (1.0 / APART))
 
 
-def compare(study: Study, off: float = OFF) -> Array:
+def compare(study: Study) -> Array:
     """Just below its limit every waypoint's loop calms down and just above it grows, and each as the analysis says.
 
     Returns:
         The limits that the two simulations give, as factors on the ones of the analysis.
     """
-    margin = margins(study)
-    rows = np.flatnonzero(np.isfinite(margin))
+    loop: Any = study.close(study.linear(study.waypoints()))
+    margin = study.gain_margin(loop)
+    rows = np.flatnonzero(np.isfinite(margin) & (margin > 0))
     assert rows.size
+    fastest = float(np.log(loop.radius(rows, (1 + OFF) * margin[rows])).max())
+    off = OFF * min(1.0, SLOW / fastest)
     below, above = 1 - off, 1 + off
     members = [*rows, *rows], np.concatenate([margin[rows] * below, margin[rows] * above]).tolist()
     found, expected = simulated(study, *members), predicted(study, *members)

@@ -62,7 +62,7 @@ ROWS = (
     "bus.build",
     "bus.live_run runner",
     # how far from shaking
-    "stability stability.filters stability.linear stability.margins stability.assist",
+    "stability stability.filters stability.linear stability.margins stability.assist stability.points",
     "stability.loops",
     "stability.sampled",
     "stability.jitter stability.instants stability.tracking",
@@ -83,7 +83,7 @@ ROWS = (
     "sweep_cluster sweep_table sweep_run",
     "sweep_search",
     "sweep",
-    "sweep_summary sweep_report",
+    "sweep_summary sweep_report sweep_theory",
     "console",
     "bus_tables sweep_cli stability_cli tune_cli",
     "bus_cli",

@@ -45,6 +45,7 @@ NOT_RUN = {
     "lwa4d-sim bus drive": "needs somebody who serves; tests/test_bus_live.py",
     "lwa4d-sim bus check": "needs a bus; tests/test_bus_cli.py",
     "lwa4d-sim bus replay": "needs a bus; tests/test_bus_live.py",
+    "lwa4d-sim sweep gain_latency": "takes minutes; tests/test_sweep_file.py and tests/test_sweep.py",
     "lwa4d-sim batch scenarios": "tests/test_thesis.py runs the same files",
     "lwa4d-sim run pd_joint_p2.5 --video": "needs OpenGL; tests/test_video.py",
 }

@@ -10,9 +10,9 @@ from stability_rig import PERIOD, apart, compare, growth, limits, margins, pd, p
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.stability.study import Study
 
-FINE = 0.0005  # [s] plant step where latencies of half a millisecond are told apart
+FINE = 0.001  # [s] plant step where latencies of a millisecond are told apart
 
-LOOPS = {
+LOOPS: dict[str, dict[str, Any]] = {
     "measurement": {"loop.latency": {"measurement": 0.005}},
     "both": {"loop.latency": {"measurement": 0.0025, "command": 0.005}},
     "longer than a period": {"loop.latency": {"measurement": 0.0125, "command": 0.0025}},
@@ -31,19 +31,19 @@ def test_limits_under_latency(name: str, actuation: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("velocity", "off"),
+    "velocity",
     [
-        ({"kind": "true"}, 0.001),  # shakes from tick to tick, and 3 % above its limit it does so at once
-        ({"kind": "backward_difference"}, 0.03),
-        ({"kind": "tustin", "time_constant": 0.02}, 0.03),
-        ({"kind": "kalman", "acceleration": 50.0, "position": 1e-3}, 0.03),
+        {"kind": "true"},
+        {"kind": "backward_difference"},
+        {"kind": "tustin", "time_constant": 0.02},
+        {"kind": "kalman", "acceleration": 50.0, "position": 1e-3},
     ],
-    ids=["true", "backward_difference", "tustin", "kalman"],
+    ids=lambda velocity: velocity["kind"],
 )
 @pytest.mark.parametrize("latency", [0.0, 0.005])
-def test_limits_with_other_estimators(velocity: dict[str, Any], off: float, latency: float) -> None:
+def test_limits_with_other_estimators(velocity: dict[str, Any], latency: float) -> None:
     changes = {"loop.velocity": velocity, "loop.latency": latency}
-    compare(limits("lwa4d_3dof", pd("joint", 0.5), changes=changes), off)
+    compare(limits("lwa4d_3dof", pd("joint", 0.5), changes=changes))
 
 
 @pytest.mark.parametrize(
@@ -74,8 +74,8 @@ def test_delay_margin_in_simulation(runs_on: str, p: float) -> None:
     study = limits("lwa4d_3dof", pd("joint", p), runs_on=runs_on, changes={"plant.timestep": FINE})
     linear = study.linear(study.waypoints())
     steps = np.rint(study.delay_margin(linear) / FINE)
-    assert (steps > 2).all()
-    for latency, grows in ((steps - 2) * FINE, False), ((steps + 2) * FINE, True):
+    assert (steps > 1).all()
+    for latency, grows in ((steps - 1) * FINE, False), ((steps + 1) * FINE, True):
         found = simulated(study, [0, 1, 2, 3], [1.0] * 4, [{"loop.latency": x} for x in latency.tolist()])
         for i, extra in enumerate(latency.tolist()):
             assert apart(found[i : i + 1], predicted(study, [i], [1.0], extra)) < 1e-3
@@ -87,20 +87,22 @@ def test_delay_margin_in_simulation(runs_on: str, p: float) -> None:
 
 def test_delay_margin_at_the_next_sync_is_what_the_wait_forgives() -> None:
     """A command in time for its SYNC is not late; where one period more is too much, that is the margin."""
-    changes = {"plant.timestep": FINE, "loop.latency": 0.0035}
+    changes = {"plant.timestep": FINE, "loop.latency": 0.003}
     study = limits("lwa4d_3dof", pd("joint", 1.6), actuation="next_sync", changes=changes)
     margin = study.delay_margin(study.linear(study.waypoints()))[3]
-    assert margin == pytest.approx(PERIOD - 0.0035, abs=1e-6)
-    calm, late = simulated(study, [3, 3], [1.0, 1.0], [{"loop.latency": 0.0095}, {"loop.latency": 0.0105}])
+    assert margin == pytest.approx(PERIOD - 0.003, abs=1e-6)
+    calm, late = simulated(study, [3, 3], [1.0, 1.0], [{"loop.latency": 0.009}, {"loop.latency": 0.011}])
     assert growth(calm) < 1 < growth(late)
 
 
 # Jitter ---------------------------------------------------------------------------------------------------------------
 
 
-def jittery(p: float, actuation: str = "immediate", **changes: Any) -> tuple[Study, Array]:
+def jittery(p: float, changes: dict[str, Any] | None = None, actuation: str = "immediate") -> tuple[Study, Array]:
     """A loop and its jitter margin at the waypoints."""
-    study = limits("lwa4d_3dof", pd("joint", p), actuation=actuation, changes={"plant.timestep": FINE, **changes})
+    study = limits(
+        "lwa4d_3dof", pd("joint", p), actuation=actuation, changes={"plant.timestep": FINE, **(changes or {})}
+    )
     return study, study.jitter_margin(study.linear(study.waypoints()))
 
 
@@ -119,10 +121,10 @@ def test_jitter_margin_is_a_share_of_the_delay_margin(p: float) -> None:
     assert (margin > 0.1 * delay).all()
 
 
-@pytest.mark.parametrize(("p", "velocity"), [(2.5, "filtered_derivative"), (2.8, "filtered_derivative"), (8, "'true'")])
+@pytest.mark.parametrize(("p", "velocity"), [(2.5, "filtered_derivative"), (2.8, "filtered_derivative"), (8, "true")])
 def test_no_switching_within_the_jitter_margin_is_unstable(p: float, velocity: str) -> None:
     """Every sequence of up to seven delays, none, half or all of the margin, that goes on for ever."""
-    study, margin = jittery(p, **{"loop.velocity": {"kind": velocity.strip("'")}})
+    study, margin = jittery(p, {"loop.velocity": {"kind": velocity}})
     linear = study.linear(study.waypoints())
     rows = np.flatnonzero((margin > 0) & (margin < PERIOD))  # one waiting command tells the whole state
     assert rows.size
@@ -134,7 +136,7 @@ def test_no_switching_within_the_jitter_margin_is_unstable(p: float, velocity: s
 
 def test_changing_delays_may_shake_what_bears_each_of_them() -> None:
     """Why there is a margin for jitter beside that for delay: 6 ms by turns with none, true speed, waypoint 2."""
-    study, margin = jittery(8.0, **{"loop.velocity": {"kind": "true"}})
+    study, margin = jittery(8.0, {"loop.velocity": {"kind": "true"}})
     linear = study.linear(study.waypoints())
     row, late = 1, 0.006
     assert margin[row] < late < study.delay_margin(linear)[row]
@@ -148,7 +150,7 @@ def test_changing_delays_may_shake_what_bears_each_of_them() -> None:
     assert by_turns[-100:].max() > 100 * by_turns[:10].max()
 
 
-PATTERNS = ([0, 1], [0, 0, 1, 1], [0, 0, 0, 1, 1, 1], [0, 0, 0, 1], [1, 1, 1, 0], [0, 0.25, 0.5, 0.75, 1], [1, 0.5, 0])
+PATTERNS = ([0, 1], [0, 0, 1, 1], [0, 0, 0, 1], [1, 1, 1, 0], [0, 0.25, 0.5, 0.75, 1])
 
 
 def fades(motion: Array) -> bool:
@@ -172,7 +174,7 @@ def test_jitter_up_to_the_margin_does_no_harm_in_simulation(p: float) -> None:
 
 
 def test_jitter_of_each_joint_on_its_own() -> None:
-    study, margin = jittery(1.25, **{"loop.per_joint": True})
+    study, margin = jittery(1.25, {"loop.per_joint": True})
     together = jittery(1.25)[1]
     assert (margin < together * (1 + 1e-9)).all(), "more may happen, so less is allowed"
     changes = [{"loop.jitter": float(most), "plant.seed": seed} for most in margin for seed in range(3)]
@@ -182,9 +184,9 @@ def test_jitter_of_each_joint_on_its_own() -> None:
 
 def test_jitter_that_the_sync_forgives_changes_no_bit() -> None:
     """Below the wait for the SYNC the margin counts the wait itself; so late commands act when they would anyway."""
-    study, margin = jittery(1.6, "next_sync", **{"loop.latency": 0.0035})
-    slack = PERIOD - 0.0035
+    study, margin = jittery(1.6, {"loop.latency": 0.003}, "next_sync")
+    slack = PERIOD - 0.003
     assert (margin >= slack * (1 - 1e-6)).all()
     assert margin[3] == pytest.approx(slack, abs=1e-6)
-    plain, shaken = simulated(study, [3, 3], [1.0, 1.0], [{}, {"loop.jitter": 0.0064}])
+    plain, shaken = simulated(study, [3, 3], [1.0, 1.0], [{}, {"loop.jitter": 0.0069}])
     np.testing.assert_array_equal(plain, shaken)

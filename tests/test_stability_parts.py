@@ -74,7 +74,8 @@ def test_filters_are_the_estimators(velocity: Any, period: float, y: Array) -> N
 def test_the_filter_in_the_drive_is_that_of_the_loop(T: float, steps: int, c: Array) -> None:
     """One joint on a cubic that begins at rest: the drive's source and the loop's differential equation agree."""
     dt = 0.001
-    rest = Linear(*(np.zeros(shape) for shape in ((1, 2, 2), (1, 2, 1), (1, 1, 2), (1, 1, 2), (1, 2, 2), (1, 2, 1))))
+    shapes = (1, 2, 2), (1, 2, 1), (1, 1, 2), (1, 1, 2), (1, 2, 2), (1, 2, 1)
+    rest = Linear.of([np.zeros(shape) for shape in shapes])
     A, _, H = continuous_part(rest, T)
     joined = np.zeros((6, 6))  # q, dq, ddq, dddq, and the two lags
     joined[0, 1] = joined[1, 2] = joined[2, 3] = 1.0
@@ -184,6 +185,8 @@ def test_a_map_holds_what_each_pose_has() -> None:
     study = limits("lwa4d_3dof", pd("joint", 0.5))
     assert default_joints(study) == (1, 2)
     rows = workspace(study, size=(4, 5))
+    assert rows.first[-1] == pytest.approx(0.5692036732051036)  # the joint's stop
+    np.testing.assert_allclose(rows.second[[0, -1]], [0.0, 2.18], atol=1e-12)  # the waypoint's side of the elbow
     for i, a in enumerate(rows.first):
         for j, b in enumerate(rows.second):
             q = np.array([study.waypoints().q[0, 0], a, b])

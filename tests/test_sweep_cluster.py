@@ -1,5 +1,6 @@
 """A sweep on a Dask cluster of real processes: the same table, whatever is killed on the way."""
 
+import json
 import os
 import signal
 import subprocess
@@ -15,6 +16,7 @@ from sweep_rig import finish, rows, write
 from lwa4d_sim import sweep_cluster
 from lwa4d_sim.errors import SweepError
 from lwa4d_sim.sweep_cluster import Cluster
+from lwa4d_sim.sweep_work import environment
 
 pytestmark = pytest.mark.slow  # a cluster needs some seconds to start
 ROOT = Path(__file__).parent.parent
@@ -49,9 +51,8 @@ class Dask:
         self.address = self._address()
 
     def worker(self, k: int) -> "subprocess.Popen[bytes]":
-        return self._start(
-            "worker", "--nthreads", "1", "--no-dashboard", "--local-directory", str(self._folder / str(k))
-        )
+        place = str(self._folder / str(k))
+        return self._start("worker", "--nthreads", "1", "--no-dashboard", "--local-directory", place)
 
     def _start(self, *what: str) -> "subprocess.Popen[bytes]":
         command = [sys.executable, "-m", "dask", *what, "--scheduler-file", str(self._file)]
@@ -59,8 +60,6 @@ class Dask:
             return subprocess.Popen(command, env=self.environ, stdout=log, stderr=log, start_new_session=True)
 
     def _address(self) -> str:
-        import json
-
         address: str = json.loads(self._file.read_text())["address"]
         return address
 
@@ -73,10 +72,11 @@ class Dask:
 
     def ready(self, count: int) -> None:
         """Wait for so many workers."""
-        from distributed import Client
+        import distributed
 
-        with Client(self.address, set_as_default=False) as client:
-            client.wait_for_workers(count, timeout=60)
+        client: Any = distributed.Client  # which has no types
+        with client(self.address, set_as_default=False) as there:
+            there.wait_for_workers(count, timeout=60)
 
     def end(self) -> None:
         for process in (*self.workers, self.scheduler):
@@ -97,10 +97,9 @@ def dask(tmp_path: Path) -> Iterator[Dask]:
 
 def begun(dask: Dask, path: Path, out: Path) -> "subprocess.Popen[str]":
     """A sweep on its way on the cluster, with some parts finished."""
-    command = [sys.executable, "-m", "lwa4d_sim", "sweep", str(path), "-o", str(out), "--no-plots"]
-    process = subprocess.Popen(
-        [*command, "--cluster", dask.address], env=dask.environ, stderr=subprocess.PIPE, text=True
-    )
+    sweep = ["sweep", str(path), "-o", str(out), "--no-plots", "--cluster", dask.address]
+    command = [sys.executable, "-m", "lwa4d_sim", *sweep]
+    process = subprocess.Popen(command, env=dask.environ, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     deadline = time.monotonic() + 60
     while len(list((out / "s" / "parts").glob("*.parquet"))) < 2:
         assert process.poll() is None, process.communicate()
@@ -115,7 +114,7 @@ def test_a_cluster_gives_the_same_table_and_other_software_is_refused(
     path = write(tmp_path)
     expected = finish(path, tmp_path / "here").table.read_bytes()
     assert finish(path, tmp_path / "there", Cluster(dask.address)).table.read_bytes() == expected
-    real = sweep_cluster.environment()
+    real = environment()
     monkeypatch.setattr(sweep_cluster, "environment", Fake({**real, "mujoco": "9.9"}))
     with pytest.raises(SweepError, match=rf"^worker tcp://.* has mujoco {real['mujoco']}, this computer has 9\.9; "):
         finish(path, tmp_path / "never", Cluster(dask.address))
@@ -132,12 +131,13 @@ class Fake:
         return self._versions
 
     def __reduce__(self) -> Any:
-        from lwa4d_sim.sweep_work import environment
-
         return getattr, (sys.modules[environment.__module__], "environment")
 
 
-def test_a_worker_or_the_client_killed_loses_nothing(dask: Dask, tmp_path: Path) -> None:
+def test_a_worker_or_the_client_killed_loses_nothing(
+    dask: Dask, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
     path, out = write(tmp_path, SLOW, axes=AXES), tmp_path / "out"
     client = begun(dask, path, out)
     os.killpg(dask.workers[0].pid, signal.SIGKILL)  # with its nanny, so that nobody starts it anew
@@ -189,10 +189,8 @@ def test_an_address_that_is_none(address: str) -> None:
 def test_a_scheduler_without_workers_says_how_to_start_some(tmp_path: Path) -> None:
     made = Dask(tmp_path, 0)
     try:
-        with (
-            pytest.raises(SweepError, match=f"has no workers; start some: dask worker {made.address}"),
-            Cluster(made.address),
-        ):
+        words = f"has no workers; start some: dask worker {made.address}"
+        with pytest.raises(SweepError, match=words), Cluster(made.address):
             pass
     finally:
         made.end()

@@ -1,5 +1,6 @@
 """Every mistake in a sweep file is one line that says file, line, key and what would be valid."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from sweep_rig import AXES, load, write
 from lwa4d_sim.console import shipped_scenarios
 from lwa4d_sim.errors import LwaError, ScenarioError
 from lwa4d_sim.sweep_cli import shipped_sweeps, sweep_path
-from lwa4d_sim.sweep_file import Sweep
+from lwa4d_sim.sweep_file import Sweep, SweepSettings
 
 P = {"from": 1, "to": 2, "count": 3, "keys": {"controller.kp": 1}}
 WRONG: list[tuple[dict[str, Any], str]] = [
@@ -145,3 +146,22 @@ def test_what_ships() -> None:
         "robustness_ct",
         "worst_case_ct",
     }
+
+
+PAGE = (Path(__file__).parent.parent / "docs" / "sweeps.md").read_text(encoding="utf-8")
+
+
+def test_the_page_names_every_key_every_design_and_every_shipped_sweep() -> None:
+    for name in (*SweepSettings.__annotations__, *(path.stem for path in shipped_sweeps().glob("*.yaml"))):
+        assert f"`{name}`" in PAGE or name.startswith("__"), name
+    for kind in ("grid", "random", "latin_hypercube", "sobol", "worst_case"):
+        assert f"{{kind: {kind}" in PAGE
+
+
+def test_the_example_of_the_page_is_a_sweep(tmp_path: Path) -> None:
+    [text] = re.findall(r"^```yaml\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+    (path := tmp_path / "gains.yaml").write_text(text)
+    sweep = Sweep.load(path, shipped_scenarios())
+    sweep.check_first()
+    assert sweep.count == 16
+    assert "16 runs" in PAGE

@@ -159,3 +159,21 @@ def test_an_interrupted_sweep_goes_on_where_it_was(how: signal.Signals, laws: st
     assert len(table) == 40
     assert {row["status"] for row in table} == {"ok"}
     assert 0 < sum(map(len, here.tasks)) < 40
+
+
+def test_workers_that_cannot_start_are_told_of_once(tmp_path: Path) -> None:
+    """A script without the guard that new processes need: each of them would run it again."""
+    path = write(tmp_path)
+    paths = [str(ROOT), str(ROOT / "tests")]
+    (script := tmp_path / "script.py").write_text(
+        f"import sys\nsys.path[:0] = {paths!r}\n"
+        "from pathlib import Path\nfrom lwa4d_sim.errors import SweepError\nfrom sweep_rig import finish\n"
+        "from lwa4d_sim.sweep_workers import Processes\n"
+        f"try:\n    finish(Path({str(path)!r}), Path({str(tmp_path / 'out')!r}), Processes(1))\n"
+        "except SweepError as error:\n    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60)
+    assert done.stdout.startswith(
+        "worker processes end as soon as they start; a script of your own must call this under"
+    )
+    assert len(done.stdout.splitlines()) == 1

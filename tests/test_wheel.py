@@ -1,4 +1,4 @@
-"""What ships: the built wheel carries models and scenarios and runs from an empty folder."""
+"""What ships: the built wheel carries models, scenarios and sweeps and runs from an empty folder."""
 
 import json
 import os
@@ -29,6 +29,9 @@ def test_the_wheel_runs_from_an_empty_folder(tmp_path: Path) -> None:
     shipped = json.loads(call("-m", "lwa4d_sim", "scenarios", "--json"))["scenarios"]
     assert set(shipped) == {file.stem for file in (ROOT / "scenarios").glob("*.yaml")}
     assert all(file.startswith(str(site)) for file in shipped.values())
+    assert {file.stem for file in (site / "lwa4d_sim" / "sweeps").iterdir()} == {
+        file.stem for file in (ROOT / "sweeps").iterdir()
+    }
     result = json.loads(call("-m", "lwa4d_sim", "run", "ct_joint_T1.5", "--json"))
     assert result["variants"]["can"]["expect"]["passed"]
     assert (empty / result["folder"] / "report.html").is_file()

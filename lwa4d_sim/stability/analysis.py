@@ -9,13 +9,15 @@ import numpy as np
 from lwa4d_sim.errors import ScenarioError
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.scenario import Scenario
-from lwa4d_sim.settings import IdealLoop
+from lwa4d_sim.settings import CanopenLoop, IdealLoop, SampledLoop
 from lwa4d_sim.stability.instants import is_random
 from lwa4d_sim.stability.margins import Mode
-from lwa4d_sim.stability.study import Points, Study
+from lwa4d_sim.stability.points import Points
+from lwa4d_sim.stability.study import Study
 
 _SAMPLES = 41  # of a chart's curve (assumed: smooth to the eye)
-_PERIODS = 3.0  # of extra latency that a chart shows
+_PERIODS = 3  # of extra latency that a chart shows
+_BESIDE = 1e-7  # [s] before and after the instant at which a SYNC is missed
 _SHORTEST, _SPREAD = 0.1, 2.5  # of the chart over the period, as shares of the scenario's own
 
 
@@ -94,6 +96,8 @@ def at_points(study: Study, points: Points) -> list[PointStability]:
 def over_latency(study: Study, points: Points) -> Curve:
     """Critical gains over an extra latency of the commands [s], from none to three periods."""
     extra = np.linspace(0.0, _PERIODS * study.period, _SAMPLES)
+    jumps = study.slack + study.period * np.arange(_PERIODS) if study.waits_for_sync else np.empty(0)
+    extra = np.unique(np.concatenate([extra, *(jumps + side * _BESIDE for side in (-1.0, 1.0))]))
     linear = study.linear(points)
     return Curve(extra, np.stack([study.gain_margin(study.close(linear, x)) for x in extra.tolist()]))
 
@@ -113,7 +117,9 @@ def remarks(study: Study) -> list[str]:
         said.append("delays vary or samples get lost: margins hold for the mean latency; compare the jitter margin")
     if np.any(study.blocks.model.dof_frictionloss > 0):
         said.append("Coulomb friction is left out: it damps small motions, so the arm shakes later and less")
-    if getattr(loop, "position_resolution", 0) or getattr(loop, "torque_resolution", 0):
+    if isinstance(loop, CanopenLoop) or (
+        isinstance(loop, SampledLoop) and (np.any(loop.position_resolution) or np.any(loop.torque_resolution))
+    ):
         said.append("resolutions are left out: near the limit they keep a small tremble alive")
     if study.bare_is_unknown:
         said.append("the gains of a law of one's own are not known: the gain margin is a factor on its whole feedback")

@@ -59,8 +59,8 @@ def jitter_margin(loop: Loop, linear: Linear, time_constant: float, slack: float
 
     (Kao and Lincoln 2004; Cervin et al. 2004 for sampled control of one input, whose squared P_alias is here
     (z - F)^-1 W (...)*, with W = integral of e^(As) B D^-1 D^-T B' e^(A's) over a period). D scales the torques against
-    each other. Where all are late alike it may be any matrix, and M^(-1/2) makes the modes of the arm independent;
-    where each is late on its own it must be diagonal and is found by balancing.
+    each other. Where each is late on its own it must be diagonal and is found by balancing; where all are late alike it
+    may be any matrix, and M^(-1/2), which makes the modes of the arm independent, is tried as well.
 
     Args:
         loop: the loop at P points.
@@ -76,7 +76,7 @@ def jitter_margin(loop: Loop, linear: Linear, time_constant: float, slack: float
     for i in np.flatnonzero(stable):
         n = linear.n
         one = _Transfer(loop, int(i), A[i], B[i])
-        gain = one.balanced() if apart else one.largest(_root(linear.B[i, n:]))
+        gain = one.balanced() if apart else min(one.balanced(), one.largest(_root(linear.B[i, n:])))
         allowed = 1.0 / (gain**2 * loop.period)
         periods = int(np.floor(np.sqrt(allowed)))
         share = 0.0 if whole else (allowed - periods**2) / (2 * periods + 1)

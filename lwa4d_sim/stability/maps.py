@@ -19,6 +19,7 @@ class Slice:
         joints: indices of the joint along the rows and of the one along the columns.
         first, second: their angles [rad], (R,) and (C,).
         x: tool points (R, C, 3) [m].
+        spectral_radius: (R, C).
         gain_margin: (R, C).
         frequency: of the mode at the limit [Hz], (R, C); nan where there is no limit.
         limiting: index of the joint that moves most in it (R, C); -1 where there is no limit.
@@ -28,6 +29,7 @@ class Slice:
     first: Array
     second: Array
     x: Array
+    spectral_radius: Array
     gain_margin: Array
     frequency: Array
     limiting: Array
@@ -67,10 +69,11 @@ def workspace(
     """
     joints = joints or default_joints(study)
     q, first, second = slice_of(study, joints, size)
-    margin, frequency = np.empty(size), np.full(size, np.nan)
+    radius, margin, frequency = np.empty(size), np.empty(size), np.full(size, np.nan)
     limiting = np.full(size, -1)
     for row in range(size[0]):
         loop = study.close(study.linear(study.resting(q[row])))
+        radius[row] = loop.radius(np.arange(size[1]), np.ones(size[1]))
         margin[row] = study.gain_margin(loop)
         bounded = np.isfinite(margin[row]) & (margin[row] > 0)
         for column in np.flatnonzero(bounded):
@@ -78,7 +81,7 @@ def workspace(
             frequency[row, column], limiting[row, column] = mode.frequency, int(np.argmax(mode.share))
         advance()
     x = study.blocks.arm.kinematics.point(q.reshape(-1, study.n)).reshape(*size, 3)
-    return Slice(joints, first, second, x, margin, frequency, limiting)
+    return Slice(joints, first, second, x, radius, margin, frequency, limiting)
 
 
 def slice_of(study: Study, joints: tuple[int, int], size: tuple[int, int]) -> tuple[Array, Array, Array]:
@@ -98,5 +101,4 @@ def slice_of(study: Study, joints: tuple[int, int], size: tuple[int, int]) -> tu
 
 def _range(study: Study, joint: int) -> tuple[float, float]:
     """A joint's range [rad]; a full turn where it has none."""
-    limits = joint_facts(study.blocks.model)[joint][1]
-    return (-np.pi, np.pi) if limits is None else (max(limits[0], -np.pi), min(limits[1], np.pi))
+    return joint_facts(study.blocks.model)[joint][1] or (-np.pi, np.pi)

@@ -5,10 +5,12 @@ from typing import Any
 
 import numpy as np
 
+from lwa4d_sim.controllers import ComputedTorque
 from lwa4d_sim.interfaces import NS_PER_S, Array
 from lwa4d_sim.runner import run
 from lwa4d_sim.settings import IdealLoop
-from lwa4d_sim.stability.study import Points, Study
+from lwa4d_sim.stability.points import Points
+from lwa4d_sim.stability.study import Study
 
 # A motion that ends within this of where it began, in angle and speed, repeats (assumed: nobody would call it closed
 # with more) [rad, rad/s].
@@ -24,7 +26,7 @@ class Course:
         t: instants [s] (P,).
         q: joint angles there (P, n) [rad].
         spectral_radius, gain_margin: of the loop frozen at each instant (P,).
-        worst: index of the smallest gain margin, or of the largest radius where none is finite.
+        worst: index of the largest radius where some loop is unstable, else of the smallest gain margin.
         floquet: for a motion that repeats, the factor by which a disturbance grows per control period over a whole
             cycle (spectral radius of the product of all periods' matrices, its root); None for one that does not.
     """
@@ -52,22 +54,26 @@ def along(study: Study) -> Course:
     loop = study.close(study.linear(points))
     P = len(points.t)
     radius, margin = loop.radius(np.arange(P), np.ones(P)), study.gain_margin(loop)
-    worst = int(np.argmin(margin)) if np.isfinite(margin).any() else int(np.argmax(radius))
+    worst = int(np.argmin(margin)) if radius.max() < 1.0 else int(np.argmax(radius))
     return Course(points.t, points.q, radius, margin, worst, _floquet(study, t))
 
 
 def path(study: Study, t: Array) -> Points:
-    """Operating points at ``t``: the motion asked for; where that jumps, at rest on the path of the ideal loop.
+    """Operating points at ``t``: where the ideal loop takes the arm.
 
-    Half-way between two steps the arm is pulled hard, and a frozen loop would tell that pull from shaking no better
-    than the eye; so those poses are looked at as if the arm stood there.
+    Computed torque follows its reference; a PD law lags behind it, so its path is found by a run. Where the reference
+    jumps, the arm is looked at as if it stood at each place of the path: half-way between two steps it is pulled hard,
+    and a frozen loop would tell that pull from shaking no better than the eye.
     """
-    if not study.steps:
+    if isinstance(study.settings.controller, ComputedTorque) and not study.steps:
         return study.along(t)
     ideal = replace(study.settings, loop=IdealLoop())
     log = run(replace(study.scenario, variants={study.variant: ideal}), study.variant)
     rows = np.minimum(np.rint(t / (log.timestep / NS_PER_S)).astype(np.int64), len(log.q) - 1)
-    return study.resting(log.q[rows], t)
+    if study.steps:
+        return study.resting(log.q[rows], t)
+    ddq = np.gradient(log.dq, log.timestep / NS_PER_S, axis=0)
+    return Points(t, log.q[rows], log.dq[rows], ddq[rows], study.along(t).ref)
 
 
 def _floquet(study: Study, t: Array) -> float | None:
@@ -84,8 +90,9 @@ def _floquet(study: Study, t: Array) -> float | None:
     ):
         return None
     ticks = round(length / study.period)
-    at = np.arange(ticks) * (length / ticks)
-    here, middle = study.linear(study.along(at)), study.linear(study.along(at + 0.5 * length / ticks))
+    last = trajectory.duration - length  # the cycle in which what the start has stirred up is over
+    at = last + np.arange(ticks) * (length / ticks)
+    here, middle = study.linear(path(study, at)), study.linear(path(study, at + 0.5 * length / ticks))
     matrices = study.close(here.with_arm(middle)).at_gain()
     product, grown = np.eye(matrices.shape[1]), 0.0
     for matrix in matrices:

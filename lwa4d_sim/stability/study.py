@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -33,27 +33,12 @@ from lwa4d_sim.stability.linear import (
 )
 from lwa4d_sim.stability.loops import Continuous, Loop
 from lwa4d_sim.stability.margins import Mode, delay_margin, gain_margin, leading_mode, spectral_radius
+from lwa4d_sim.stability.points import Points
 from lwa4d_sim.stability.sampled import Instants, close
 
 _POINTS_AT_ONCE = 256  # operating points linearised together: 7,424 arms of 7 joints, some tens of megabytes (assumed)
 _LONGEST = 50  # periods of extra latency that are tried (assumed: half a second at 10 ms)
 _INSTANTS = 12  # of a motion without waypoints that are looked at (assumed)
-
-
-@dataclass(frozen=True, slots=True)
-class Points:
-    """Operating points: instants of the motion [s] (P,), with q, dq, ddq (P, n) and the references there."""
-
-    t: Array
-    q: Array
-    dq: Array
-    ddq: Array
-    ref: Any
-
-    def part(self, rows: slice | IntArray) -> "Points":
-        """Some of the points."""
-        ref = type(self.ref)(*(None if field is None else field[rows] for field in self.ref))
-        return Points(self.t[rows], self.q[rows], self.dq[rows], self.ddq[rows], ref)
 
 
 class Study:
@@ -269,9 +254,9 @@ class Study:
         if isinstance(loop, Continuous):
             return np.full(len(linear.A), np.nan)
         settings = self._sampled
-        whole = settings.actuation == "next_sync"
+        whole = self.waits_for_sync
         apart = getattr(settings, "per_joint", not whole)  # on a bus each joint has a frame of its own
-        slack = self._slack() if whole else 0.0
+        slack = self.slack if whole else 0.0
         return jitter_margin(loop, linear, self._filter(settings).time_constant, slack, whole=whole, apart=apart)
 
     @property
@@ -279,7 +264,13 @@ class Study:
         assert not isinstance(self.loop_settings, IdealLoop)
         return self.loop_settings
 
-    def _slack(self) -> float:
+    @property
+    def waits_for_sync(self) -> bool:
+        """Whether torques act at a SYNC."""
+        return not self.ideal and self._sampled.actuation == "next_sync"
+
+    @cached_property
+    def slack(self) -> float:
         """How much later the latest command may come and still be in time for its SYNC [s]."""
         settings = self._sampled
         planned = self._instants(settings, 0.0).acts
