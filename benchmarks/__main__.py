@@ -22,6 +22,7 @@ import numpy as np
 from mujoco import rollout
 from mujoco.batch import Batch
 
+from benchmarks import scale
 from lwa4d_sim.batch import default_workers
 from lwa4d_sim.bus.live_run import report
 from lwa4d_sim.bus.wire import Wire
@@ -203,6 +204,13 @@ BENCHMARKS: dict[str, tuple[Callable[[], tuple[float, float]], str, float]] = {
     "memory": (memory, "peak bytes per joint and plant step", 40.0),
     "canopen": (canopen, "20 s over the CANopen cycle: wall / simulated time", 0.1),
     "frame": (frame, "a frame on the timed wire / on python-can's virtual", 1.0),
+    "chart": (scale.chart, "32 x 32 chart of 20 s runs / raw threaded loop", 1.25),
+    "processes": (scale.processes, "the same chart / 1,024 lwa4d-sim run processes", 0.1),
+    "linear": (scale.linear, "a run more at 16,384 / at 64 to 4,096", 1.2),
+    "flat": (scale.flat, "peak memory with 16,384 runs / with 64", 1.3),
+    "workers": (scale.workers, "a sweep on two Dask workers / on one", 0.59),
+    "pose": (scale.pose, "stability of one pose, milliseconds", 1.0),
+    "map": (scale.workspace_map, "critical gains of 50 x 50 poses of 7 joints, seconds", 10.0),
     "live": (live, "cycles missed in 60 s of bus serve and bus drive", 0.0),
 }
 

@@ -21,6 +21,15 @@ SPREAD = ("max_error", "rms_error", "final_error", "vibration", "peak_torque", "
 MOST_LINES = 2_000  # of parallel coordinates; more would be a solid block
 BINS = 8  # of an axis with many values, in the plot of shares
 _REQUIRED = 4  # different values that an axis of a map has at least
+# Units of the keys that a sweep moves; what stands below one, such as the parameters of a latency law, has its unit.
+_UNITS = {
+    "s": ("loop.period", "loop.latency", "loop.jitter", "loop.phase", "segment_time", "time_constant", "horizon"),
+    "rad": ("position_resolution",),
+    "rad/s": ("disturbance_observer.bandwidth",),
+    "N m": ("torque_resolution", "friction.coulomb"),
+    "N m s/rad": ("friction.viscous",),
+    "kg": ("payload.mass",),
+}
 
 Curve = Sequence[tuple[float, float]]
 
@@ -149,7 +158,7 @@ def draw_heat_map(
         colours = "viridis_r"
     x_log, y_log = x[0] in log, y[0] in log
     mesh = ax.pcolormesh(_edges(columns, x_log), _edges(rows, y_log), cells, cmap=colours, norm=norm)
-    ax.set(xlabel=plain(x[0]), ylabel=plain(y[0]))
+    ax.set(xlabel=labelled(*x), ylabel=labelled(*y))
     ax.set(xscale="log" if x_log else "linear", yscale="log" if y_log else "linear")
     ax.grid(visible=False)
     if flag:
@@ -162,6 +171,12 @@ def draw_heat_map(
         ax.plot(*np.asarray(boundary, float).T, color=BLACK, lw=2.0)
         ax.set(xlim=limits[0], ylim=limits[1])
     return figure
+
+
+def labelled(name: str, values: Any) -> str:
+    """An axis's name, with the unit where its values are numbers that have one."""
+    unit = next((unit for unit, keys in _UNITS.items() if any(f".{key}." in f".{name}." for key in keys)), "")
+    return f"{plain(name)} [{unit}]" if unit and isinstance(values, np.ndarray) else plain(name)
 
 
 def _edges(centres: Array, log: bool) -> Array:
@@ -187,7 +202,7 @@ def _shares(runs: Runs) -> _Made:
         at = np.arange(len(labels))
         bars = np.maximum(0.0, [share - ends[0], ends[1] - share])  # rounding leaves -1e-17
         ax.errorbar(at, share, bars, fmt="o", color=GOOD, ecolor=GREY, capsize=2, ms=4)
-        ax.set(ylim=(-0.05, 1.05), xlabel=plain(name), xlim=(-0.5, len(labels) - 0.5))
+        ax.set(ylim=(-0.05, 1.05), xlabel=labelled(name, runs.axes[name]), xlim=(-0.5, len(labels) - 0.5))
         thin = max(1, -(-len(labels) // BINS))
         ax.set_xticks(
             at[::thin], labels[::thin], fontsize=SMALL, rotation=20 if sum(map(len, labels[::thin])) > 42 else 0
@@ -262,7 +277,7 @@ def _parallel(runs: Runs) -> _Made:
         scaled.append((shown - ends[0]) / np.ptp(ends) if high > low else np.full(len(values), 0.5))
         ax.text(k, 1.03, f"{high:.3g}", ha="center", va="bottom", fontsize=SMALL, color=GREY)
         down = "\n" * (1 + k % 2)  # on two lines by turns, for names are long
-        ax.text(k, -0.03, f"{low:.3g}{down}{plain(name)}", ha="center", va="top", fontsize=SMALL)
+        ax.text(k, -0.03, f"{low:.3g}{down}{labelled(name, values)}", ha="center", va="top", fontsize=SMALL)
         ax.axvline(k, color=GREY, lw=0.8)
     lines = np.stack(scaled, axis=1)
     lines[~runs.stable, -1] = 1.0

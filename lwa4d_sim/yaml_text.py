@@ -34,7 +34,7 @@ for _tag, _pattern, _first in (
 
 def dump(document: Any) -> str:
     """Plain data as YAML that `parse` reads back; short lists and mappings stand on one line."""
-    text: str = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
+    text: str = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120)
     return text
 
 

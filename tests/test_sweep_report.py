@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from sweep_rig import AXES, finish, load, write
 
 from lwa4d_sim.drawing import BLACK
-from lwa4d_sim.sweep_plots import BAD, GOOD, Runs, draw_heat_map, draw_sweep
+from lwa4d_sim.sweep_plots import BAD, GOOD, Runs, draw_heat_map, draw_sweep, labelled
 from lwa4d_sim.sweep_report import report
 from lwa4d_sim.sweep_summary import summarise
 
@@ -128,6 +128,22 @@ def test_a_logarithmic_axis_is_drawn_as_one() -> None:
     figure = draw_heat_map("s", ("x", x), ("y", y), ("z", x + y), log=frozenset({"x"}))
     assert (figure.axes[0].get_xscale(), figure.axes[0].get_yscale()) == ("log", "linear")
     np.testing.assert_allclose(figure.axes[0].get_xlim(), [10**-1.5, 10**1.5])
+
+
+@pytest.mark.parametrize(
+    ("name", "label"),
+    [
+        ("loop.latency", "loop.latency [s]"),
+        ("variants.can.loop.latency.tail", "variants.can.loop.latency.tail [s]"),
+        ("controller.model.payload.mass", "controller.model.payload.mass [kg]"),
+        ("plant.mass_scale", "plant.mass_scale"),
+        ("loop.loss", "loop.loss"),
+    ],
+)
+def test_axes_have_their_units(name: str, label: str) -> None:
+    x = np.array([1.0, 2.0])
+    assert draw_heat_map("s", (name, x), ("y", x), ("z", x)).axes[0].get_xlabel() == label
+    assert labelled(name, ["none", "5 ms"]) == name
 
 
 def shown(figure: Figure) -> Any:

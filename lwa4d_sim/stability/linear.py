@@ -47,6 +47,12 @@ class Linear:
         A, B, law, bare, A_model, B_model = parts
         return cls(A, B, law, bare, A_model, B_model)
 
+    def pick(self, rows: IntArray) -> "Linear":
+        """Some of the points."""
+        curve = self.curve
+        some = Linear.of([part[rows] for part in self.parts])
+        return some if curve is None else replace(some, curve=lambda which, k: curve(rows[which], k))
+
     def with_arm(self, other: "Linear") -> "Linear":
         """This law on the arm of ``other``."""
         return replace(self, A=other.A, B=other.B)

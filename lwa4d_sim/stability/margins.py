@@ -1,7 +1,7 @@
 """Margins of sampled loops: spectral radius, critical gain, extra latency, and the mode that goes unstable."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,7 @@ _TURNS = 60  # bisections and more leave nothing to do
 
 
 Radius = Callable[[IntArray, Array], Array]
+LateRadius = Callable[[IntArray, float], Array]
 
 
 class Mode(NamedTuple):
@@ -114,37 +115,34 @@ def root(f: Callable[[Array], Array], a: Array, b: Array, fa: Array, fb: Array, 
     return b
 
 
-def delay_margin(radius: Callable[[float], Array], period: float, longest: float) -> Array:
+def delay_margin(radius: LateRadius, points: int, period: float, longest: float) -> Array:
     """Extra latency (P,) [s] of the commands at which each loop becomes unstable; inf beyond ``longest``, 0 if it is.
 
     Args:
-        radius: spectral radii (P,) with a given extra latency [s].
+        radius: spectral radii of some of the loops, given their rows and the extra latency [s].
+        points: number of loops P.
         period: control period [s]; the search goes in quarters of it.
         longest: [s] where to give up.
     """
-    margin = np.where(radius(0.0) <= 1.0 + _STILL, np.inf, 0.0)
+    margin = np.where(radius(np.arange(points), 0.0) <= 1.0 + _STILL, np.inf, 0.0)
     low = 0.0
     for i in range(1, round(4 * longest / period) + 1):
-        if not np.isinf(margin).any():
+        waiting = np.flatnonzero(np.isinf(margin))
+        if not waiting.size:
             break
         high = 0.25 * i * period
-        crossed = np.flatnonzero(np.isinf(margin) & (radius(high) > 1.0 + _STILL))
-        if crossed.size:
-            margin[crossed] = _bisect(radius, crossed, low, high)
+        for row in waiting[radius(waiting, high) > 1.0 + _STILL]:
+            margin[row] = _bisect(radius, np.array([row]), low, high)
         low = high
     return margin
 
 
-def _bisect(radius: Callable[[float], Array], rows: Any, low: float, high: float) -> Array:
-    """Each row's own bisection; a jump (at a SYNC missed) is found like a crossing."""
-    found = np.empty(len(rows))
-    for i, row in enumerate(rows):
-        a, b = low, high
-        while b - a > 1e-9:
-            c = 0.5 * (a + b)
-            a, b = (c, b) if radius(c)[row] <= 1.0 + _STILL else (a, c)
-        found[i] = a
-    return found
+def _bisect(radius: LateRadius, row: IntArray, low: float, high: float) -> float:
+    """A jump (at a SYNC missed) is found like a crossing."""
+    while high - low > 1e-9:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if radius(row, middle)[0] <= 1.0 + _STILL else (low, middle)
+    return low
 
 
 def leading_mode(matrix: Array, n: int, period: float) -> Mode:

@@ -242,10 +242,10 @@ class Study:
         if isinstance(loop, Continuous):
             return continuous_delay_margin(loop)
 
-        def radius(extra: float) -> Array:
-            return spectral_radius(self.close(linear, extra).at_gain())
+        def radius(rows: IntArray, extra: float) -> Array:
+            return spectral_radius(self.close(linear.pick(rows), extra).at_gain())
 
-        margin: Array = delay_margin(radius, loop.period, _LONGEST * loop.period)
+        margin: Array = delay_margin(radius, len(linear.A), loop.period, _LONGEST * loop.period)
         return margin
 
     def jitter_margin(self, linear: Linear) -> Array:
