@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from lwa4d_sim.errors import ScenarioError
@@ -70,6 +71,31 @@ def short(value: Any) -> str:
 def one_line(text: str) -> str:
     """``text`` with line breaks and other unprintable characters escaped."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where the keys of a document stand.
+
+    Attributes:
+        source: the file.
+        document: as plain data.
+        lines: of its paths.
+    """
+
+    source: str
+    document: Any
+    lines: Mapping[Path, int]
+
+    def error(self, path: Path, rule: str) -> ScenarioError:
+        """An error at a key: file, line, key, value, rule."""
+        line = next((self.lines[path[:cut]] for cut in range(len(path), 0, -1) if path[:cut] in self.lines), None)
+        value: Any = self.document
+        for part in path:
+            value = value[part] if isinstance(value, dict) and part in value else None
+        shown = "" if value is None or isinstance(value, (dict, list)) else f" (={short(value)})"
+        where = self.source if line is None else f"{self.source}:{line}"
+        return ScenarioError(one_line(f"{where}: {dotted(path)}{shown}: {rule}"))
 
 
 def merge(base: Any, override: Any) -> Any:

@@ -131,8 +131,12 @@ class RunLog:
         """
         partial = path.with_name(path.name + ".part")
         try:
-            with _open(partial, "w") as file:
+            # made in memory, because HDF5 on a full disk crashes the program
+            with _open(path, "w", driver="core", backing_store=False) as file:
                 self._write(file)
+                file.flush()
+                image = file.id.get_file_image()
+            partial.write_bytes(image)
             os.replace(partial, path)
         except (OSError, RuntimeError) as error:  # h5py raises either
             with suppress(OSError):
@@ -247,10 +251,10 @@ _TICK_UNITS = {
 }
 
 
-def _open(path: Path, mode: str) -> Any:
+def _open(path: Path, mode: str, **driver: Any) -> Any:
     import h5py  # a fifth of a second; only files need it
 
-    return h5py.File(path, mode)
+    return h5py.File(path, mode, **driver)
 
 
 def _text_type() -> Any:

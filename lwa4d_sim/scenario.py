@@ -75,9 +75,7 @@ class Scenario:
         document, lines = parse(text, source)
         if not isinstance(document, dict):
             raise ScenarioError(f"{source}: must be a mapping with the keys {', '.join(_TOP_KEYS)}")
-        for key, kind in CHOICES.items():  # so that an override of another kind is seen to be one
-            if isinstance(document.get(key), Mapping):
-                document[key] = {"kind": kind, **document[key]}
+        document = _with_kinds(document)
         bare = Scenario(
             name=str(document.get("name", "")),
             source=source,
@@ -112,6 +110,7 @@ class Scenario:
                 document = put(document, key, value)
             except ScenarioError as error:
                 raise ScenarioError(one_line(f"{self.source}: {error}")) from None
+        document = _with_kinds(document)
         name = str(document.get("name", ""))
         return replace(self, name=name, document=document, overrides={**self.overrides, **values})
 
@@ -129,6 +128,8 @@ class Scenario:
         return list(variants) if variants else [DEFAULT_VARIANT]
 
     def _check_top(self) -> None:
+        if "axes" in self.document and "scenario" in self.document:
+            raise ScenarioError(f"{self.source}: is a sweep; it belongs to lwa4d-sim sweep")
         for key in self.document:
             if key not in _TOP_KEYS:
                 raise self.error((key,), unknown_key(key, _TOP_KEYS))
@@ -209,6 +210,12 @@ class Scenario:
 
 
 _ABSENT = object()
+
+
+def _with_kinds(document: Mapping[str, Any]) -> dict[str, Any]:
+    """The document with left-out kinds filled in, so that an override of another kind is seen to be one."""
+    kinds = {key: kind for key, kind in CHOICES.items() if isinstance(document.get(key), Mapping)}
+    return {**document, **{key: {"kind": kind, **document[key]} for key, kind in kinds.items()}}
 
 
 def read_text(path: Path, what: str) -> str:

@@ -256,6 +256,8 @@ def _phrase(member: Any, plural: bool = False) -> str:
             return f"{'lists' if plural else 'a list'} of {len(args)} {items}"
         some = "one or more " if any(isinstance(rule, MinLen) for rule in rules) else ""
         return f"{'lists' if plural else 'a list'} of {some}{items}"
+    if bare is Any:
+        return "values of any kind" if plural else "anything"
     return "mappings" if plural else "a mapping"
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lwa4d_sim.console import Json, Out, Set, override, progress, scenario_path
+from lwa4d_sim.console import Json, Out, Set, busy, override, progress, scenario_path
 from lwa4d_sim.errors import ScenarioError
 
 _PIPE_WIDTH = 160  # columns where nobody watches
@@ -36,18 +36,20 @@ def stability(
     Example: lwa4d-sim stability pd_joint_p2.5 -o runs
     """
     from lwa4d_sim.scenario import Scenario
-    from lwa4d_sim.stability_findings import check_joints, find, points_as_objects, with_charts
+    from lwa4d_sim.stability_findings import CURVES, check_joints, find, points_as_objects, with_charts
     from lwa4d_sim.stability_folder import claim_for, write_findings
     from lwa4d_sim.stability_words import details, headline
 
     scenario = Scenario.load(scenario_path(file), dict(override(text) for text in overrides or []))
     folder = None if no_plots else claim_for(scenario, out)
-    found, points = find(scenario, variant, poses or [])
+    with busy("margins", quiet=as_json):
+        found, points = find(scenario, variant, poses or [])
     pair = check_joints(found.study, None if joints is None else _pair(joints))
     if folder is not None:
-        with progress("workspace map", size, quiet=as_json) as advance:
+        with progress("map and charts", CURVES + (size if pair else 0), quiet=as_json) as advance:
             found = with_charts(found, points, pair, size, advance)
-        write_findings(folder, found)
+        with busy("drawing", quiet=as_json):
+            write_findings(folder, found)
     if as_json:
         print(
             json.dumps(

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -26,7 +26,10 @@ from lwa4d_sim.stability.points import Points
 from lwa4d_sim.stability.study import Study
 
 STILL = 1e-9  # [-] beyond 1 that a spectral radius may be by the rounding of numeric slopes (derived)
+CURVES = 3  # charts that take longer than a moment, beside the map
 _DRAWN = 12  # operating points whose curves a chart can hold (assumed: what an eye can tell apart)
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,7 @@ def with_charts(
         points: their operating points.
         joints: indices of the two joints that the map moves.
         size: angles of each of them.
-        advance: called after each row of the map.
+        advance: called after each row of the map, and after each of `CURVES` charts.
 
     Raises:
         ScenarioError: there are no such joints.
@@ -120,13 +123,18 @@ def with_charts(
     rows = sorted({*np.linspace(0, len(points.q) - 1, min(_DRAWN, len(points.q))).round().astype(int).tolist()})
     some = Points(points.t[rows], points.q[rows], points.dq[rows], points.ddq[rows], _part(points.ref, rows))
     pair = check_joints(study, joints)
+
+    def done(chart: _T) -> _T:
+        advance()
+        return chart
+
     one = None if pair is None else workspace(study, pair, (size, size), advance)
     charts = Charts(
         rows=rows,
-        latency=None if study.ideal else over_latency(study, some),
-        period=None if study.ideal else over_period(study, some),
+        latency=done(None if study.ideal else over_latency(study, some)),
+        period=done(None if study.ideal else over_period(study, some)),
         poles=None if study.ideal else np.linalg.eigvals(study.close(study.linear(some)).at_gain(np.ones(len(rows)))),
-        course=along(study),
+        course=done(along(study)),
         map=one,
         map_stable=np.ones(0, bool) if one is None else one.spectral_radius <= 1.0 + STILL,
         alike=[pair is not None and _alike(study, q, pair) for q in points.q],
@@ -142,6 +150,8 @@ def check_joints(study: Study, joints: tuple[int, int] | None) -> tuple[int, int
     """
     if joints is None:
         return None if study.n < 2 else default_joints(study)
+    if study.n < 2:
+        raise ScenarioError(f"--joints {joints[0] + 1},{joints[1] + 1}: a map moves two joints, and the arm has one")
     a, b = joints
     if not (0 <= a < study.n and 0 <= b < study.n and a != b):
         raise ScenarioError(f"--joints {a + 1},{b + 1}: must be two different joints of 1 to {study.n}")

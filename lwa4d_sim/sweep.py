@@ -74,8 +74,8 @@ class Folder:
             return
         try:
             before = json.loads((self.path / ABOUT).read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            before = about if not any(self.path.iterdir()) else {}
+        except FileNotFoundError:  # nothing there yet, or the disk was full
+            before = {} if self.parts() or self.table.exists() else about
         except ValueError:
             before = {}
         if before.get("identity") != about["identity"]:
@@ -150,6 +150,8 @@ def run_sweep(
     if sweep.count > limit:
         raise SweepError(_too_many(sweep, limit, workers))
     if isinstance(sweep.settings.design, WorstCase):
+        for corner in sweep.points():
+            sweep.check_point(corner)
         folder = Folder.open(sweep, out, fresh=fresh)
         points = search(sweep, _evaluator(sweep, folder, workers, watch))
     else:

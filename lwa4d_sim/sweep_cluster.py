@@ -1,9 +1,11 @@
 """Workers on other computers: the workers of a running Dask scheduler, reached by its address."""
 
 import logging
+import re
+import threading
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from queue import Empty, Queue
 from typing import Any
 
@@ -15,7 +17,8 @@ from lwa4d_sim.sweep_workers import Done
 _CONNECT = 6.0  # [s] a scheduler in reach answers within a fraction of one
 _SILENCE = 6.0  # [s] without a connection after which the scheduler is taken for gone
 _LOOK = 0.5  # [s] between two looks at the connection
-_SCHEMES = ("tcp", "tls", "ws", "wss", "ucx")  # that Dask knows
+# with the schemes that Dask knows; it takes seconds to find that anything else leads nowhere
+_ADDRESS = re.compile(r"((tcp|tls|wss?|ucx)://)?[^\s/]+:\d{1,5}")
 _AHEAD = 2  # tasks a thread: one to work on, one on its way
 
 
@@ -90,14 +93,15 @@ class Cluster:
             from distributed import Client
         except ImportError as error:
             raise SweepError("--cluster needs the package 'distributed': pip install 'lwa4d_sim[cluster]'") from error
-        scheme, mark, _ = self._address.partition("://")
-        if mark and scheme not in _SCHEMES:
+        if not _ADDRESS.fullmatch(self._address):
             raise SweepError(f"cluster {self._address}: must be an address such as tcp://host:8786")
         _hush()
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # versions are compared below, and a difference is an error
-                self._client = Client(self._address, timeout=_CONNECT, set_as_default=False)
+                self._client = _within(
+                    _CONNECT + 1.0, lambda: Client(self._address, timeout=_CONNECT, set_as_default=False)
+                )
         except (OSError, ValueError, TimeoutError) as error:
             raise SweepError(
                 f"cluster {self._address}: no Dask scheduler answers there within {_CONNECT:g} s"
@@ -128,6 +132,30 @@ class Cluster:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             self._client.close(timeout=2)
+
+
+def _within(seconds: float, make: Callable[[], Any]) -> Any:
+    """What ``make`` makes; Dask's own limit does not hold where something else than Dask listens.
+
+    Raises:
+        TimeoutError: it takes longer.
+    """
+    made: Queue[tuple[Any, Exception | None]] = Queue()
+
+    def attempt() -> None:
+        try:
+            made.put((make(), None))
+        except Exception as error:
+            made.put((None, error))
+
+    threading.Thread(target=attempt, daemon=True).start()
+    try:
+        value, error = made.get(timeout=seconds)
+    except Empty:
+        raise TimeoutError from None
+    if error is not None:
+        raise error
+    return value
 
 
 def _hush() -> None:

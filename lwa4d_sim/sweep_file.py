@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple
@@ -12,7 +12,7 @@ from annotated_types import Ge, MinLen
 
 from lwa4d_sim.assembly import build_blocks
 from lwa4d_sim.documents import Path as KeyPath
-from lwa4d_sim.documents import dotted, one_line, short
+from lwa4d_sim.documents import Place, one_line
 from lwa4d_sim.errors import LwaError, ScenarioError
 from lwa4d_sim.interfaces import STRICT
 from lwa4d_sim.metrics import METRICS
@@ -54,6 +54,9 @@ class SweepSettings:
     axes: Mapping[str, Axis]
     seeds: Annotated[int, Ge(1)] = 1
     metrics: Annotated[tuple[str, ...], MinLen(1)] | None = None
+
+
+_KEYS = tuple(field.name for field in fields(SweepSettings))
 
 
 class Point(NamedTuple):
@@ -99,8 +102,12 @@ class Sweep:
         text = read_text(path, "sweep")
         document, lines = parse(text, source)
         if not isinstance(document, dict):
-            raise ScenarioError(f"{source}: must be a mapping with the keys {', '.join(SweepSettings.__annotations__)}")
-        place = _Place(source, document, lines)
+            raise ScenarioError(f"{source}: must be a mapping with the keys {', '.join(_KEYS)}")
+        place = Place(source, document, lines)
+        if "axes" not in document and "trajectory" in document:
+            raise ScenarioError(
+                f"{source}: is a scenario; a sweep names one under 'scenario' and what varies under 'axes'"
+            )
         try:
             settings = fit(document, SweepSettings)
         except Misfit as misfit:
@@ -112,7 +119,8 @@ class Sweep:
         try:
             scenario = Scenario.load(file, settings.set)
         except ScenarioError as error:
-            raise place.error(("set" if settings.set else "scenario",), str(error)) from error
+            at_fault = "set" if settings.set and _loads(file) else "scenario"
+            raise place.error((at_fault,), str(error)) from error
         variant = settings.variant or next(iter(scenario.variants))
         if variant not in scenario.variants:
             names = ", ".join(scenario.variants)
@@ -190,11 +198,15 @@ class Sweep:
         document = made.resolved(self.variant)
         for name, value in first.values.items():
             for key, asked in self._overrides(name, value).items():
-                if key.split(".")[0] != "variants" and not _holds(document, key, asked):
-                    rule = (
-                        f"moves nothing: variant '{self.variant}' sets {key} itself; name variants.{self.variant}.{key}"
-                    )
-                    raise self.error(("axes", name), rule)
+                top, *rest = key.split(".")
+                if top in ("name", "expect") or (top == "variants" and rest[:1] != [self.variant]):
+                    rule = f"moves nothing in variant '{self.variant}', which is what runs"
+                elif top == "variants" or _holds(document, key, asked):
+                    continue
+                else:
+                    rule = f"variant '{self.variant}' sets {key} itself; name variants.{self.variant}.{key}"
+                    rule = f"moves nothing: {rule}"
+                raise self.error(("axes", name), rule)
         try:
             build_blocks([made], self.variant, 1)
         except LwaError as error:
@@ -202,7 +214,7 @@ class Sweep:
 
     def error(self, path: KeyPath, rule: str) -> ScenarioError:
         """An error at a key of this file: file, line, key, rule."""
-        return _Place(self.source, self._document, self._lines).error(path, rule)
+        return Place(self.source, self._document, self._lines).error(path, rule)
 
     def identity(self) -> str:
         """A hash of all that the table depends on, but for the versions of the software."""
@@ -222,25 +234,7 @@ class Sweep:
         return isinstance(self.scenario.variants[self.variant].loop, CanopenLoop)
 
 
-@dataclass(frozen=True, slots=True)
-class _Place:
-    """Where the keys of a document stand."""
-
-    source: str
-    document: Any
-    lines: Mapping[KeyPath, int]
-
-    def error(self, path: KeyPath, rule: str) -> ScenarioError:
-        line = next((self.lines[path[:cut]] for cut in range(len(path), 0, -1) if path[:cut] in self.lines), None)
-        value: Any = self.document
-        for part in path:
-            value = value[part] if isinstance(value, dict) and part in value else None
-        shown = "" if value is None or isinstance(value, (dict, list)) else f" (={short(value)})"
-        where = self.source if line is None else f"{self.source}:{line}"
-        return ScenarioError(one_line(f"{where}: {dotted(path)}{shown}: {rule}"))
-
-
-def _check(settings: SweepSettings, place: _Place) -> None:
+def _check(settings: SweepSettings, place: Place) -> None:
     """What the classes cannot say.
 
     Raises:
@@ -263,7 +257,9 @@ def _check(settings: SweepSettings, place: _Place) -> None:
     taken: dict[str, str] = {SEED: "seeds"} if settings.seeds > 1 else {}
     for name, axis in settings.axes.items():
         at = ("axes", name)
-        if name in RESERVED or name in METRICS or not name.strip():
+        if not name.strip():
+            raise place.error(at, "an axis needs a name")
+        if name in RESERVED or name in METRICS:
             raise place.error(at, "cannot be an axis: the table has a column of its own of this name")
         if isinstance(design, Grid) and not axis.grid():
             rule = "a grid needs values, or from, to and count; laws belong to random, latin_hypercube and sobol"
@@ -278,6 +274,15 @@ def _check(settings: SweepSettings, place: _Place) -> None:
             taken[key] = f"axis {name}"
         if axis.keys is not None and not axis.keys:
             raise place.error((*at, "keys"), "is empty; name at least one key of the scenario")
+
+
+def _loads(file: Path) -> bool:
+    """Whether the scenario is fine by itself."""
+    try:
+        Scenario.load(file)
+    except ScenarioError:
+        return False
+    return True
 
 
 def _holds(document: Any, key: str, asked: Any) -> bool:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from lwa4d_sim.errors import LwaError
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.metrics import METRICS
 from lwa4d_sim.sweep_design import WorstCase, mapped
@@ -45,6 +46,9 @@ def search(sweep: Sweep, evaluate: Evaluate) -> list[Point]:
     Args:
         sweep: with a design of kind worst_case.
         evaluate: rows of points.
+
+    Raises:
+        LwaError: whatever ``evaluate`` raises.
     """
     from scipy.optimize import Bounds, differential_evolution
     from scipy.stats import qmc
@@ -62,17 +66,22 @@ def search(sweep: Sweep, evaluate: Evaluate) -> list[Point]:
         return -np.array([score(row, design.objective, duration(sweep)) for row in evaluate(new)])
 
     vectorised: Any = objective  # whose type the stubs know for one point at a time only
-    differential_evolution(
-        vectorised,
-        Bounds(np.zeros(dimensions), np.ones(dimensions)),
-        init=qmc.LatinHypercube(dimensions, rng=design.seed).random(members),
-        maxiter=max(0, design.evaluations // members - 1),
-        tol=1e-6,  # ends early only where all members are at one point
-        polish=False,
-        updating="deferred",
-        vectorized=True,
-        rng=design.seed,
-    )
+    try:
+        differential_evolution(
+            vectorised,
+            Bounds(np.zeros(dimensions), np.ones(dimensions)),
+            init=qmc.LatinHypercube(dimensions, rng=design.seed).random(members),
+            maxiter=max(0, design.evaluations // members - 1),
+            tol=1e-6,  # ends early only where all members are at one point
+            polish=False,
+            updating="deferred",
+            vectorized=True,
+            rng=design.seed,
+        )
+    except RuntimeError as error:  # SciPy's wrapping of a ValueError, which many of ours are
+        if isinstance(error.__cause__, LwaError):
+            raise error.__cause__ from None
+        raise
     return points
 
 

@@ -18,4 +18,5 @@ def wilson(passed: int, runs: int, z: float = Z95) -> tuple[float, float]:
     share = passed / runs
     centre = (share + z**2 / (2 * runs)) / (1 + z**2 / runs)
     half = z / (1 + z**2 / runs) * math.sqrt(share * (1 - share) / runs + z**2 / (4 * runs**2))
-    return max(0.0, centre - half), min(1.0, centre + half)
+    # the ends are exact where no rounding must spoil them
+    return (0.0 if passed == 0 else centre - half), (1.0 if passed == runs else centre + half)

@@ -59,7 +59,7 @@ def tune(
     """
     from lwa4d_sim.scenario import Scenario
     from lwa4d_sim.stability.analysis import default_variant
-    from lwa4d_sim.tuned_file import tuned_document, verified, write_tuned
+    from lwa4d_sim.tuned_file import place_for, tuned_document, verified, write_tuned
     from lwa4d_sim.tuning import Wish, tune
 
     _require("--gain-margin", gain_margin, 1.0, 1000.0)
@@ -75,10 +75,10 @@ def tune(
         peak=peak,
         workspace=over is OverOption.workspace,
     )
+    path = place_for(scenario, out)
     with busy(f"tuning {scenario.name}", quiet=as_json):
         found = tune(scenario, name, wish)
         runs = verified(scenario, name, found)
-    path = out / f"{scenario.name}_tuned.yaml"
     write_tuned(path, tuned_document(scenario, name, found, path.stem), scenario, name, wish)
     answer = {
         "gains": dict(found.overrides),

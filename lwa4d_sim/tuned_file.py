@@ -1,6 +1,7 @@
 """A tuned scenario as a file of its own: the document with new gains, checked by running it."""
 
 import os
+import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
 from copy import deepcopy
@@ -13,6 +14,8 @@ from lwa4d_sim.runner import run
 from lwa4d_sim.scenario import Scenario
 from lwa4d_sim.tuning import Tuned, Wish
 from lwa4d_sim.yaml_text import dump
+
+_MADE = "# Made by lwa4d-sim tune"
 
 
 def tuned_document(scenario: Scenario, variant: str, tuned: Tuned, name: str) -> dict[str, Any]:
@@ -34,6 +37,25 @@ def _make_absolute(block: dict[str, Any], folder: Path) -> None:
         trajectory["file"] = str((folder / trajectory["file"]).resolve())
 
 
+def place_for(scenario: Scenario, out: Path) -> Path:
+    """The file that the tuned scenario goes into, after making sure that it may.
+
+    Raises:
+        RecordError: a folder cannot be there, or there is a file that was not made by a tuning.
+    """
+    path = out / f"{scenario.name}_tuned.yaml"
+    try:
+        ours = not path.exists() or _MADE in path.read_text(encoding="utf-8", errors="replace")
+        # the nearest folder that is there already, so that bad input leaves not even an empty folder behind
+        with tempfile.TemporaryFile(dir=next(place for place in (out, *out.absolute().parents) if place.exists())):
+            pass
+    except OSError as error:
+        raise RecordError(f"{path}: cannot write the tuned scenario ({error.strerror})") from error
+    if not ours:
+        raise RecordError(f"{path}: is there already and was not made by a tuning; choose another folder with -o")
+    return path
+
+
 def write_tuned(path: Path, document: Mapping[str, Any], scenario: Scenario, variant: str, wish: Wish) -> None:
     """Write the scenario, whole or not at all.
 
@@ -44,7 +66,7 @@ def write_tuned(path: Path, document: Mapping[str, Any], scenario: Scenario, var
     lines = [
         f"# {scenario.name}, variant {variant}, tuned: {what}, for the {_aim(wish)}",
         f"# that bears {wish.gain_margin:g} times its gains and {1e3 * wish.delay_margin:g} ms more delay everywhere.",
-        f"# Made by lwa4d-sim tune from {scenario.source}; other variants have the gains that they had.",
+        f"{_MADE} from {scenario.source}; other variants have the gains that they had.",
     ]
     partial = path.with_name(f"{path.name}.part")
     try:

@@ -26,6 +26,7 @@ _RANGE = (1e-3, 1e3)  # of the gains that are tried, as factors on the scenario'
 _STEP = 0.1  # of the logarithm of a common factor; a narrower window of good gains is missed (assumed)
 _EVALUATIONS = {"two": 60, "joints": 150}  # at most, by number of gains (assumed: seconds to a minute)
 _SIMULATIONS = 60  # at most, where each evaluation is a run
+_RATIOS = (1.0, 1.2, 1.5, 2.0)  # damping ratios from which the joints' gains are searched (assumed)
 _WORKSPACE = (8, 8)  # poses of a workspace that are looked at
 
 
@@ -129,33 +130,39 @@ class _Search:
         start = self._start()
         if self._wish.gains == "one" and self._wish.objective == "bandwidth":
             return start  # of one gain the largest is the fastest
-        if self._wish.gains == "joints":  # no worse than with two gains, then
-            fewer = _Search(self._study, replace(self._wish, gains="two"), self._advance)
-            two = np.repeat(fewer._best_gains(), len(self._kp))
-            self._evaluations += fewer._evaluations
-            if self._excess(start) > 0 or (self._excess(two) <= 0 and self._cost(two) < self._cost(start)):
-                start = two
+        if self._wish.gains == "joints":
+            starts = [start, *(self._start(ratio) for ratio in _RATIOS[1:]), self._two()]
+            kept = [one for one in starts if self._excess(one) <= 0]
+            start = min(kept or starts[:1], key=self._cost)
         return self._improved(start)
 
-    def _start(self) -> Array:
-        """The largest common factor that keeps the margins, never mind the peak."""
+    def _two(self) -> Array:
+        """The best two gains, for all joints: more freedom is not to be worse."""
+        fewer = _Search(self._study, replace(self._wish, gains="two"), self._advance)
+        found: Array = np.repeat(fewer._best_gains(), len(self._kp))
+        self._evaluations += fewer._evaluations
+        return found
+
+    def _start(self, ratio: float = 1.0) -> Array:
+        """The largest gains of a ray that keep the margins, never mind the peak."""
         low, high = np.log(_RANGE)
         steps = np.arange(high, low, -_STEP).tolist()
-        kept = next((s for s in steps if self._beyond_margins(self._ray(s), roughly=True) <= 0), None)
+        kept = next((s for s in steps if self._beyond_margins(self._ray(s, ratio), roughly=True) <= 0), None)
         if kept is None:
             asked = f"a gain margin of {self._wish.gain_margin:g} and {1e3 * self._wish.delay_margin:g} ms more delay"
             raise ScenarioError(f"{self._study.scenario.source}: no factor on these gains bears {asked} at every pose")
         good, bad = kept, kept + _STEP
         while bad - good > 1e-6:
             middle = 0.5 * (good + bad)
-            good, bad = (middle, bad) if self._beyond_margins(self._ray(middle), roughly=True) <= 0 else (good, middle)
-        return self._ray(good)
+            keeps = self._beyond_margins(self._ray(middle, ratio), roughly=True) <= 0
+            good, bad = (middle, bad) if keeps else (good, middle)
+        return self._ray(good, ratio)
 
-    def _ray(self, s: float) -> Array:
-        """Gains along which the search begins: a common factor e^s; for joints one frequency e^s, critically damped."""
+    def _ray(self, s: float, ratio: float) -> Array:
+        """Gains along which the search begins: a common factor e^s; for joints one frequency e^s and damping ratio."""
         if self._wish.gains != "joints":
             return np.full({"one": 1, "two": 2}[self._wish.gains], s)
-        stiffness, damping = np.exp(2.0 * s) * self._inertia, 2.0 * np.exp(s) * self._inertia
+        stiffness, damping = np.exp(2.0 * s) * self._inertia, 2.0 * ratio * np.exp(s) * self._inertia
         ray: Array = np.log(np.concatenate([stiffness / self._kp, damping / self._kd]))
         return ray
 

@@ -19,6 +19,10 @@ class _Loader(yaml.CSafeLoader):
     yaml_implicit_resolvers = {}  # noqa: RUF012  (PyYAML's own class attribute)
 
 
+class _Dumper(yaml.SafeDumper):
+    """PyYAML's writer; puts quotes around text that either YAML 1.1 or `parse` would take for something else."""
+
+
 for _tag, _pattern, _first in (
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
     ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
@@ -29,12 +33,13 @@ for _tag, _pattern, _first in (
         list("-+0123456789."),
     ),
 ):
-    _Loader.add_implicit_resolver(_TAG + _tag, re.compile(f"^(?:{_pattern})$"), _first)
+    for _side in (_Loader, _Dumper):
+        _side.add_implicit_resolver(_TAG + _tag, re.compile(f"^(?:{_pattern})$"), _first)
 
 
 def dump(document: Any) -> str:
     """Plain data as YAML that `parse` reads back; short lists and mappings stand on one line."""
-    text: str = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120)
+    text: str = yaml.dump(document, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=120)
     return text
 
 

@@ -34,6 +34,7 @@ PAGES = [
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 TIMING = (ROOT / "docs" / "timing.md").read_text(encoding="utf-8")
 VALIDATION = (ROOT / "docs" / "validation.md").read_text(encoding="utf-8")
+TUNING = (ROOT / "docs" / "tuning.md").read_text(encoding="utf-8")
 
 # Commands on the pages that are not run here, each with the reason.
 NOT_RUN = {
@@ -143,6 +144,23 @@ def test_matlab_names_of_the_readme_exist(tour: Path) -> None:
     for file, name in asked:
         with h5py.File(tour / file) as record:
             assert name in record
+
+
+@pytest.mark.slow
+def test_what_the_page_of_tuning_prints_is_what_is_printed(tmp_path: Path) -> None:
+    done = call(next(commands(TUNING)), tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines() == blocks(TUNING, "text")[0].splitlines()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", table(TUNING, "`pd_joint_p2.5`, `can`"), ids=lambda row: row[0].strip("`"))
+def test_the_table_of_tuned_gains(row: list[str], tmp_path: Path) -> None:
+    answer = json.loads(call(f"lwa4d-sim tune pd_joint_p2.5 {row[0].strip('`')} --json", tmp_path).stdout)["after"]
+    ran = answer["metrics"]
+    millimetres = [1e3 * ran["rms_error"], 1e3 * max(ran["final_error"])]
+    shown = [f"{answer['bandwidth']:.3f}", *(f"{x:.2f}" for x in (answer["peak"], *millimetres))]
+    assert row[1:] == shown
 
 
 @pytest.mark.parametrize("name", ["errata", "validation", "benchmarks", "timing", "models", "canopen", "architecture"])

@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -256,3 +258,19 @@ def test_a_file_that_is_no_record_is_refused(spoil: Any, words: str, logs: dict[
         RunLog.load(path)
     assert str(error.value).startswith(f"{path}: not a readable run record")
     assert words in str(error.value)
+
+
+def test_a_full_disk_is_an_error_and_no_crash(tmp_path: Path) -> None:
+    """A limit on the size of files stands for the disk; HDF5 itself would end the process with a signal."""
+    code = (
+        "import resource, sys; from pathlib import Path; from lwa4d_sim import RunLog; from lwa4d_sim.errors import *\n"
+        "log = RunLog.load(Path('whole.h5')); resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))\n"
+        "try: log.save(Path('small.h5'))\n"
+        "except RecordError as error: print(error)\n"
+    )
+    log = run(Scenario.parse(TEXT), "ideal")
+    log.save(tmp_path / "whole.h5")
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert re.fullmatch(r"small\.h5: cannot write the record \(.*File too large\)\n", done.stdout)
+    assert [path.name for path in tmp_path.iterdir()] == ["whole.h5"]

@@ -680,3 +680,11 @@ def test_the_examples_on_the_page_are_valid() -> None:
     for block in blocks:
         base = yaml.safe_load(SMALL)
         Scenario.parse(yaml.safe_dump({**base, **yaml.safe_load(block)}), source="docs/scenario.md")
+
+
+def test_an_override_of_a_block_that_the_file_leaves_out_does_not_reach_a_variant_of_another_kind() -> None:
+    document = yaml.safe_load(SMALL)
+    text = json.dumps({**document, "variants": {"ideal": {"loop": {"kind": "ideal"}}, "can": {}}})
+    made = Scenario.parse(text, overrides={"loop.latency": 0.002})
+    assert made.variants["can"].loop == SampledLoop(latency=0.002)
+    assert made.variants["ideal"].loop == IdealLoop()

@@ -20,7 +20,7 @@ from lwa4d_sim.errors import RecordError
 from lwa4d_sim.scenario import Scenario
 from lwa4d_sim.stability.analysis import PointStability
 from lwa4d_sim.stability.margins import Mode
-from lwa4d_sim.stability_findings import Findings, find
+from lwa4d_sim.stability_findings import CURVES, Findings, find, with_charts
 from lwa4d_sim.stability_words import headline, moves
 
 PAGE = (Path(__file__).parent.parent / "docs" / "stability.md").read_text(encoding="utf-8")
@@ -69,7 +69,8 @@ def refused(result: Result, words: str) -> None:
     [line] = result.err.splitlines()
     assert line.startswith("lwa4d-sim: ")
     assert re.search(words, line), line
-    assert {path.name for path in Path().iterdir()} <= {"small.yaml", "blind.py", "__pycache__"}
+    given = {"small.yaml", "blind.py", "laws_with_faults.py", "one.xml", "one.yaml", "__pycache__"}
+    assert {path.name for path in Path().iterdir()} <= given
 
 
 def test_json_keeps_its_contract(call: Call) -> None:
@@ -190,6 +191,11 @@ BAD = [
     (["small.yaml", "--joints", "2"], r"--joints 2: must be two joint numbers"),
     (["small.yaml", "--size", "1"], r"--size"),
     (["small.yaml", "--set", "loop.period=0"], r"loop\.period"),
+    (
+        ["small.yaml", "--set", "loop.period=100"],
+        r"loop\.period .*grow beyond all numbers within 100 s; give a shorter",
+    ),
+    (["small.yaml", "--set", "loop.latency=3"], r"loop\.latency .*data are 300 periods late in all; .* takes 50"),
     (["small.yaml", "--set", "controller={kind: 'blind:Nothing'}"], r"controller"),
 ]
 
@@ -281,3 +287,59 @@ def test_commands_of_the_page_run(call: Call) -> None:
         assert words[:2] == ["lwa4d-sim", "stability"]
         result = call(*words[2:], "--no-plots")
         assert (result.code, result.err) == (0, ""), line
+
+
+LAWS = """
+import numpy as np
+
+class Raises:
+    def torque(self, state, ref, model): raise ZeroDivisionError("my fault")
+
+class Blank:
+    def torque(self, state, ref, model): return np.full_like(state.q, np.nan)
+
+class Integrates:
+    total = 0.0
+    def torque(self, state, ref, model):
+        self.total = self.total + (ref.q - state.q)
+        return 2.0 * (ref.q - state.q) - 3.0 * state.dq + self.total
+"""
+
+
+@pytest.mark.parametrize(
+    ("law", "words"),
+    [
+        ("Raises", r"torque\(\) fails for 26 arms at once: ZeroDivisionError: my fault; a law with a memory"),
+        ("Blank", r"torque\(\) has no finite slope near q = 0\.3, -0\.6, 0\.9"),
+        ("Integrates", r"torque\(\) answers differently when asked the same again; a law with a memory cannot be"),
+    ],
+)
+def test_a_law_of_ones_own_that_has_no_slope(
+    law: str, words: str, call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "laws_with_faults.py").write_text(LAWS)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    refused(call("small.yaml", "--set", f"controller={{kind: 'laws_with_faults:{law}'}}", "-o", "out"), words)
+
+
+def test_the_bar_ends_where_the_work_ends() -> None:
+    steps: list[None] = []
+    scenario = Scenario.parse(yaml.safe_dump(SMALL))
+    found, points = find(scenario)
+    with_charts(found, points, None, 4, lambda: steps.append(None))
+    assert len(steps) == 4 + CURVES
+
+
+def test_an_arm_of_one_joint_has_no_map(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "one.xml").write_text(ONE_JOINT)
+    changes = {"arm": "one.xml", "initial": {"q": [0.1]}}
+    changes["trajectory"] = {"waypoints": {"space": "joint", "points": [[0.3]]}, "segment_time": 0.5}
+    (tmp_path / "one.yaml").write_text(yaml.safe_dump({**SMALL, **changes}))
+    refused(call("one.yaml", "--joints", "1,2", "-o", "out"), "a map moves two joints, and the arm has one")
+    assert call("one.yaml", "--no-plots").code == 0
+
+
+ONE_JOINT = """
+<mujoco><worldbody><body><joint name="a" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".03" mass="2"/>
+<site name="tcp" pos=".3 0 0"/></body></worldbody><actuator><motor joint="a"/></actuator></mujoco>
+"""

@@ -196,6 +196,16 @@ def test_another_sweep_in_the_folder_is_refused_and_thrown_away_when_asked(tmp_p
         finish(other, tmp_path / "out")
 
 
+def test_a_folder_that_a_full_disk_left_empty_is_taken(tmp_path: Path) -> None:
+    path = write(tmp_path, axes={"p": AXES["p"]})
+    (tmp_path / "out" / "s" / "parts").mkdir(parents=True)
+    (tmp_path / "out" / "s" / "sweep.yaml").write_text("half")
+    assert len(rows(finish(path, tmp_path / "out"))) == 4
+    (tmp_path / "out" / "s" / "sweep.json").unlink()
+    with pytest.raises(SweepError, match="holds another sweep"):  # nobody knows of what its parts are
+        finish(path, tmp_path / "out")
+
+
 def test_a_folder_begun_with_other_software_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, axes={"p": AXES["p"]})
     about = finish(path, tmp_path / "out").path / "sweep.json"

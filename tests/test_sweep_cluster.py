@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -180,7 +181,7 @@ def test_a_dead_scheduler_is_one_line_within_ten_seconds(dask: Dask, tmp_path: P
     assert time.monotonic() - start < 10
 
 
-@pytest.mark.parametrize("address", ["foo://bar", "http://x:80"])
+@pytest.mark.parametrize("address", ["foo://bar", "http://x:80", "garbage", "", "tcp://no such host:1"])
 def test_an_address_that_is_none(address: str) -> None:
     with pytest.raises(SweepError, match="must be an address such as tcp://host:8786"), Cluster(address):
         pass
@@ -194,3 +195,13 @@ def test_a_scheduler_without_workers_says_how_to_start_some(tmp_path: Path) -> N
             pass
     finally:
         made.end()
+
+
+def test_what_listens_but_is_no_scheduler(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"127.0.0.1:{silent.getsockname()[1]}"
+        command = [sys.executable, "-m", "lwa4d_sim", "sweep", str(path), "-o", str(tmp_path), "--cluster", address]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert done.stderr == f"lwa4d-sim: cluster {address}: no Dask scheduler answers there within 6 s\n"

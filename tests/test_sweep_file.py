@@ -35,7 +35,10 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"axes": {"p": {"from": 1, "count": 2}}}, "axes.p.to: is missing; it must be a number"),
     ({"axes": {"p": {**P, "from": 0, "scale": "log"}}}, "axes.p: from and to must be above 0 on a log scale"),
     ({"axes": {"p": {"from": 1, "to": 2}}}, "axes.p: a grid needs values, or from, to and count"),
-    ({"axes": {"controller.kp": {"values": []}}}, "axes.controller.kp.values: must be a list of one or more"),
+    ({"axes": {"controller.kp": {"values": []}}}, "kp.values: must be a list of one or more values of any kind"),
+    ({"axes": {" ": P}}, "axes. : an axis needs a name"),
+    ({"scenario": "none.yaml", "set": {"controller.kp": 3}}, "scenario (='none.yaml'): "),
+    ({"scenario": "sweep.yaml"}, "is a sweep; it belongs to lwa4d-sim sweep"),
     ({"axes": {"p": {"values": ["a"], "keys": {"controller.kp": 2}}}}, "factors other than 1 need values"),
     ({"axes": {"run": P}}, "axes.run: cannot be an axis: the table has a column of its own of this name"),
     ({"axes": {"stable": P}}, "axes.stable: cannot be an axis"),
@@ -76,6 +79,10 @@ LATE: list[tuple[dict[str, Any], str]] = [
     ({"axes": {"controller.kp": {"values": [-1.0]}}}, "must be a number of at least 0"),
     ({"axes": {"loop.actuation": {"values": ["next_sync"]}}, "variant": "late"}, "moves nothing: variant 'late' sets"),
     ({"axes": {"arm": {"values": ["none.xml"]}}}, "no such file"),
+    ({"axes": {"name": {"values": ["a", "b"]}}}, "axes.name: moves nothing in variant 'can', which is what runs"),
+    ({"axes": {"variants.late.loop.latency": {"values": [0.01]}}}, "moves nothing in variant 'can'"),
+    ({"axes": {"variants.none.loop.latency": {"values": [0.01]}}}, "moves nothing in variant 'can'"),
+    ({"axes": {"expect.can.stable": {"values": [True]}}}, "axes.expect.can.stable: moves nothing in variant 'can'"),
     ({"axes": {"plant.timestep": {"values": [0.003]}}}, "is not a whole multiple of the plant step 0.003 s"),
 ]
 
@@ -101,6 +108,18 @@ def test_the_line_is_that_of_the_axis(tmp_path: Path) -> None:
     sweep = load(path)
     with pytest.raises(ScenarioError, match=rf"^{path}:5: axes\.controller\.kd: .*\(=-1, overridden\)"):
         [sweep.check_point(point) for point in sweep.points()]
+
+
+def test_a_scenario_is_no_sweep(tmp_path: Path) -> None:
+    write(tmp_path)
+    with pytest.raises(ScenarioError, match=r"small\.yaml: is a scenario; a sweep names one under 'scenario'"):
+        load(tmp_path / "small.yaml")
+
+
+def test_only_keys_are_offered(tmp_path: Path) -> None:
+    (path := tmp_path / "x.yaml").write_text("")
+    with pytest.raises(ScenarioError, match=r"keys name, scenario, variant, set, design, axes, seeds, metrics$"):
+        load(path)
 
 
 @pytest.mark.parametrize("text", ["", "3", "[1]", "name: [", "\x00"])

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from sweep_rig import Here, finish, load, rows, write
 
+from lwa4d_sim.errors import ScenarioError
 from lwa4d_sim.sweep_file import Point
 from lwa4d_sim.sweep_search import duration, score, search
 from lwa4d_sim.sweep_summary import summarise
@@ -93,3 +94,20 @@ def test_a_search_makes_a_table_of_all_it_looked_at(tmp_path: Path) -> None:
 def test_the_duration_is_that_of_the_motion(tmp_path: Path) -> None:
     sweep = load(write(tmp_path, axes=REGION, design=design()))
     assert duration(sweep) == pytest.approx(0.1)
+
+
+def test_a_region_that_does_not_fit_is_one_line_and_writes_nothing(tmp_path: Path) -> None:
+    path = write(tmp_path, axes={"controller.kp": {"from": -1, "to": 5}}, design=design())
+    with pytest.raises(ScenarioError, match=r"axes\.controller\.kp: .*must be a number of at least 0"):
+        finish(path, tmp_path / "out", Here(1))
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_a_search_meets_is_told_as_it_is(tmp_path: Path) -> None:
+    sweep = load(write(tmp_path, axes=REGION, design=design()))
+
+    def evaluate(points: Sequence[Point]) -> list[Mapping[str, Any]]:
+        raise ScenarioError("of one point")
+
+    with pytest.raises(ScenarioError, match=r"^of one point$"):
+        search(sweep, evaluate)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from test_cli import Result, refused
 from test_cli import call as call  # a fixture
@@ -171,6 +171,12 @@ def test_a_file_that_cannot_be_written_is_named(call: Callable[..., Result], tmp
     refused(call("tune", "pd_joint_p2.5", "-o", str(tmp_path / "file")), "cannot write the tuned scenario")
 
 
+def test_a_file_of_ones_own_is_left_alone(call: Callable[..., Result], tmp_path: Path) -> None:
+    (path := tmp_path / "pd_joint_p2.5_tuned.yaml").write_text("# my own gains\n")
+    refused(call("tune", "pd_joint_p2.5", "-o", str(tmp_path)), "was not made by a tuning; choose another folder")
+    assert path.read_text() == "# my own gains\n"
+
+
 _plain = st.recursive(
     st.none()
     | st.booleans()
@@ -183,5 +189,6 @@ _plain = st.recursive(
 
 
 @given(st.dictionaries(st.text(), _plain, max_size=4))
+@example({"0E0": "1e3", "a": 1e300})  # numbers of YAML 1.2, text in 1.1
 def test_what_is_dumped_is_read_back(document: dict[str, Any]) -> None:
     assert parse(dump(document), "test")[0] == document

@@ -8,6 +8,7 @@ import numpy as np
 
 from lwa4d_sim.controllers import CustomController
 from lwa4d_sim.dynamics import NominalModel
+from lwa4d_sim.errors import LwaError, ScenarioError
 from lwa4d_sim.interfaces import ArmModel, Array, Controller, IntArray, JointReference, JointState, TaskReference
 
 # Step of the central differences [rad, rad/s]: truncation 1e-12 and rounding 1e-10 of the slopes are alike (derived).
@@ -92,7 +93,9 @@ def linearise_arm(arm: NominalModel, q: Array, dq: Array, ddq: Array, *, passive
     return A, B
 
 
-def linearise_law(controller: Controller, model: ArmModel, q: Array, dq: Array, ref: Any) -> Array:
+def linearise_law(
+    controller: Controller, model: ArmModel, q: Array, dq: Array, ref: Any, *, own: bool = False
+) -> Array:
     """Slope of the torque over the estimated state, (P, n, 2n), by central differences of the law itself.
 
     Args:
@@ -101,12 +104,34 @@ def linearise_law(controller: Controller, model: ArmModel, q: Array, dq: Array, 
         q: operating points (P, n) [rad].
         dq: their speeds [rad/s].
         ref: JointReference or TaskReference with leading axis P.
+        own: whether the law is a user's, which is asked twice, for it may have a memory.
+
+    Raises:
+        ScenarioError: the law fails, has a memory, or has no finite slope.
     """
     P, n = q.shape
     rows = _rows(q, dq, n)
     repeated = type(ref)(*(None if field is None else np.repeat(field, 4 * n + 1, axis=0) for field in ref))
-    tau = controller.torque(JointState(*rows), repeated, model)
-    return _slopes(tau.reshape(P, 4 * n + 1, n), n)
+    try:
+        tau = controller.torque(JointState(*rows), repeated, model)
+        again = controller.torque(JointState(*rows), repeated, model) if own else tau
+    except LwaError:
+        raise
+    except Exception as error:  # a user's own may raise anything
+        failed = f"torque() fails for {len(rows[0])} arms at once: {type(error).__name__}: {error}"
+        raise ScenarioError(f"{failed}; a law with a memory, or for one arm only, cannot be linearised") from error
+    if not np.array_equal(tau, again, equal_nan=True):
+        rule = "torque() answers differently when asked the same again; a law with a memory cannot be linearised"
+        raise ScenarioError(rule)
+    with np.errstate(invalid="ignore"):
+        slopes = _slopes(tau.reshape(P, 4 * n + 1, n), n)
+    if not np.isfinite(slopes).all():
+        raise ScenarioError(f"torque() has no finite slope near q = {_told(q[~np.isfinite(slopes).all((1, 2))][0])}")
+    return slopes
+
+
+def _told(q: Array) -> str:
+    return ", ".join(f"{angle:.4g}" for angle in q)
 
 
 def rows_needed(points: int, n: int) -> int:

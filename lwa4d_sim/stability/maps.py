@@ -88,7 +88,8 @@ def slice_of(study: Study, joints: tuple[int, int], size: tuple[int, int]) -> tu
     """Poses (R, C, n) of a slice, and the angles of its two joints (R,) and (C,), see `workspace`."""
     i, j = joints
     if not (0 <= i < study.n and 0 <= j < study.n and i != j):
-        raise ScenarioError(f"joints {i + 1} and {j + 1} make no slice; give two of 1 to {study.n}")
+        rule = f"give two of 1 to {study.n}" if study.n > 1 else "an arm of one joint has none"
+        raise ScenarioError(f"joints {i + 1} and {j + 1} make no slice of the workspace; {rule}")
     here = study.waypoints().q[0]
     low, high = _range(study, i)
     first = np.linspace(low, high, size[0])

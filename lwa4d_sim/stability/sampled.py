@@ -10,6 +10,8 @@ from lwa4d_sim.stability.filters import Filter
 from lwa4d_sim.stability.linear import Linear
 from lwa4d_sim.stability.loops import Loop
 
+_HUGE = 1e100  # growth within a period beyond which products overflow (derived)
+
 
 class Instants(NamedTuple):
     """When things happen in a period, joint by joint.
@@ -61,6 +63,9 @@ def close(linear: Linear, estimator: Filter, instants: Instants, assist: Assist 
         estimator: of each joint's speed; not used where ``assist`` has a state observer.
         instants: when samples are taken and torques act.
         assist: predictor and observers.
+
+    Raises:
+        OverflowError: the arm falls so far within a period that no number can say it.
     """
     n, T = linear.n, instants.period
     whole = np.floor(instants.acts / T + 1e-9).astype(np.int64)
@@ -212,7 +217,10 @@ def _discrete(A: Array, B: Array, T: float, part: Array) -> tuple[Array, Array, 
     s, n = B.shape[1:]
     joined = np.zeros((len(A), s + n, s + n))
     joined[:, :s, :s], joined[:, :s, s:] = A, B
-    whole = expm(joined * T)
+    with np.errstate(over="ignore", invalid="ignore"):
+        whole = expm(joined * T)
+    if not (np.abs(whole) < _HUGE).all():
+        raise OverflowError(f"disturbances of the arm grow beyond all numbers within {T:g} s")
     step, full = whole[:, :s, :s], whole[:, :s, s:]
     late = full.copy()
     for a in np.unique(part[part > 0]).tolist():

@@ -38,6 +38,7 @@ from lwa4d_sim.stability.sampled import Instants, close
 
 _POINTS_AT_ONCE = 256  # operating points linearised together: 7,424 arms of 7 joints, some tens of megabytes (assumed)
 _LONGEST = 50  # periods of extra latency that are tried (assumed: half a second at 10 ms)
+_LATEST = 50  # periods that commands and samples may be late; longer ones take minutes (measured)
 _INSTANTS = 12  # of a motion without waypoints that are looked at (assumed)
 
 
@@ -63,6 +64,12 @@ class Study:
             self._believed = load_model(self.settings.arm, belief, base=scenario.folder)
             self._make_law()
         self._arms: dict[tuple[str, int], NominalModel] = {}
+        if isinstance(self.loop_settings, SampledLoop):
+            instants = self._instants(self.loop_settings, 0.0)
+            late = float((instants.old + instants.acts / instants.period).max())
+            if late > _LATEST:
+                rule = f"data are {late:.0f} periods late in all; the linear loop takes {_LATEST}"
+                raise scenario.error(("loop", "latency"), rule, variant)
 
     def _make_law(self) -> None:
         self._law = build_controller([self.settings], self.blocks.arm)
@@ -183,7 +190,8 @@ class Study:
             A_model, B_model = A, B  # nobody asks
         else:
             A_model, B_model = linearise_arm(believed, points.q, points.dq, points.ddq, passive=False)
-        law = linearise_law(self._law, believed, points.q, points.dq, points.ref)
+        with self.blocks.about("controller"):
+            law = linearise_law(self._law, believed, points.q, points.dq, points.ref, own=self.bare_is_unknown)
         if self._bare is None:
             bare = np.zeros_like(law)
         else:
@@ -230,7 +238,10 @@ class Study:
         if self.ideal:
             return Continuous.of(linear, self.period)
         loop: Any = self.loop_settings if period is None else replace(self._sampled, period=period)
-        return close(linear, self._filter(loop), self._instants(loop, extra), self._assist(loop))
+        try:
+            return close(linear, self._filter(loop), self._instants(loop, extra), self._assist(loop))
+        except OverflowError as error:
+            raise self.scenario.error(("loop", "period"), f"{error}; give a shorter one", self.variant) from None
 
     def gain_margin(self, loop: Loop | Continuous) -> Array:
         """Factor (P,) on all gains at which each loop changes its stability, see `margins.gain_margin`."""
