@@ -13,7 +13,7 @@ from lwa4d_sim.bus_cli import bus_app
 from lwa4d_sim.console import Json, Out, Set, busy, complain, override, progress, scenario_path, shipped_scenarios
 from lwa4d_sim.errors import LwaError, ScenarioError
 from lwa4d_sim.stability_cli import stability
-from lwa4d_sim.sweep_cli import sweep
+from lwa4d_sim.sweep_cli import shipped_sweeps, sweep
 from lwa4d_sim.tune_cli import tune
 
 app = typer.Typer(
@@ -142,17 +142,20 @@ def schema(
 
 @app.command()
 def scenarios(as_json: Json = False) -> None:
-    """List the scenarios that come with the package.
+    """List the scenarios and sweeps that come with the package.
 
     Example: lwa4d-sim scenarios
     """
-    files = sorted(shipped_scenarios().glob("*.yaml"))
+    folders = {"scenarios": shipped_scenarios(), "sweeps": shipped_sweeps()}
+    files = {what: sorted(folder.glob("*.yaml")) for what, folder in folders.items()}
     if as_json:
-        print(json.dumps({"scenarios": {file.stem: str(file) for file in files}}))
+        print(json.dumps({what: {file.stem: str(file) for file in found} for what, found in files.items()}))
         return
-    for file in files:
-        first = file.read_text(encoding="utf-8").splitlines()[0]
-        print(f"{file.stem:28} {first.removeprefix('#').strip()}")
+    for what, found in files.items():
+        print(f"{what}:")
+        for file in found:
+            first = file.read_text(encoding="utf-8").splitlines()[0]
+            print(f"  {file.stem:28} {first.removeprefix('#').strip()}")
 
 
 def _combined(summaries: list[dict[str, Any]], out: Path) -> Path:

@@ -84,7 +84,7 @@ def _print_table(found: Any) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from lwa4d_sim.stability_words import factor, milliseconds, unstable
+    from lwa4d_sim.stability_words import factor, milliseconds, radius, unstable
 
     columns = (
         "",
@@ -101,7 +101,7 @@ def _print_table(found: Any) -> None:
         table.add_row(
             name,
             "UNSTABLE" if unstable(point) else "stable",
-            f"{point.spectral_radius:.4f}",
+            radius(point.spectral_radius),
             factor(point.gain_margin),
             milliseconds(point.delay_margin),
             milliseconds(point.jitter_margin),

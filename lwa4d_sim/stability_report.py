@@ -12,7 +12,7 @@ from lwa4d_sim.page import write_page
 from lwa4d_sim.settings import CanopenLoop, IdealLoop
 from lwa4d_sim.stability.maps import default_joints
 from lwa4d_sim.stability_findings import Findings
-from lwa4d_sim.stability_words import details, factor, headline, milliseconds, unstable
+from lwa4d_sim.stability_words import details, factor, headline, milliseconds, radius, unstable
 
 _SIZE = 50  # of a map that no option made larger or smaller
 
@@ -75,7 +75,7 @@ def _rows(found: Findings) -> list[Mapping[str, Any]]:
         {
             "name": name,
             "unstable": unstable(point),
-            "radius": f"{point.spectral_radius:.4f}",
+            "radius": radius(point.spectral_radius),
             "gain": factor(point.gain_margin),
             "delay": milliseconds(point.delay_margin),
             "jitter": milliseconds(point.jitter_margin),

@@ -16,6 +16,12 @@ def unstable(point: PointStability) -> bool:
     return point.spectral_radius > 1.0 + STILL
 
 
+def radius(value: float) -> str:
+    """A spectral radius with as many digits as tell it from 1."""
+    short = f"{value:.4f}"
+    return short if float(short) != 1.0 else f"{value:.7f}"
+
+
 def headline(found: Findings) -> str:
     """The verdict in one or two sentences."""
     bad = [k for k, point in enumerate(found.points) if unstable(point)]

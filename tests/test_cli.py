@@ -153,10 +153,11 @@ def test_a_shipped_scenario_goes_by_its_name(call: Callable[..., Result]) -> Non
     assert scenario_path("pd_joint_p2.5").is_file()
     write("pd_joint_p2.5")  # a file of that name comes first
     assert scenario_path("pd_joint_p2.5") == Path("pd_joint_p2.5")
-    listed = json.loads(call("scenarios", "--json").out)["scenarios"]
-    assert listed.keys() == {path.stem for path in (ROOT / "scenarios").glob("*.yaml")}
-    lines = call("scenarios").out.splitlines()
-    assert len(lines) == len(listed)
+    listed = json.loads(call("scenarios", "--json").out)
+    for what in ("scenarios", "sweeps"):
+        assert listed[what].keys() == {path.stem for path in (ROOT / what).glob("*.yaml")}
+    lines = [line for line in call("scenarios").out.splitlines() if line.startswith("  ")]
+    assert [line.split()[0] for line in lines] == [*listed["scenarios"], *listed["sweeps"]]
     assert all(len(line.split(maxsplit=1)) == 2 for line in lines)
 
 

@@ -1,8 +1,10 @@
 """A user's own control law: a class on `sys.path`, named in the scenario as `package.module:Class`."""
 
 import importlib
+import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -54,11 +56,20 @@ class _Checked:
     law: Controller
 
     def torque(self, state: JointState, ref: Any, model: ArmModel) -> Array:
-        tau = np.array(self.law.torque(state, ref, model), float)
+        try:
+            tau = np.array(self.law.torque(state, ref, model), float)
+        except Exception as error:  # it may raise anything; its author needs the line
+            raise ScenarioError(f"torque() of {self.kind} raised {_told(error)}", key="controller.kind") from error
         if tau.shape != state.q.shape:
             rule = f"must be {state.q.shape}: a row for each simulation, a column for each joint"
             raise ScenarioError(f"torque() of {self.kind} returned shape {tau.shape}; {rule}", key="controller.kind")
         return tau
+
+
+def _told(error: Exception) -> str:
+    """What a user's own code raised, and where in it."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({Path(last.filename).name}, line {last.lineno})"
 
 
 def load_object(kind: str, key: str, options: Mapping[str, Any]) -> Any:

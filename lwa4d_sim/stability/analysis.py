@@ -18,6 +18,7 @@ from lwa4d_sim.stability.study import Study
 _SAMPLES = 41  # of a chart's curve (assumed: smooth to the eye)
 _PERIODS = 3  # of extra latency that a chart shows
 _BESIDE = 1e-7  # [s] before and after the instant at which a SYNC is missed
+_MOST = 10  # commands on their way at the shortest period that a chart shows
 _SHORTEST, _SPREAD = 0.1, 2.5  # of the chart over the period, as shares of the scenario's own
 
 
@@ -104,7 +105,9 @@ def over_latency(study: Study, points: Points) -> Curve:
 
 def over_period(study: Study, points: Points) -> Curve:
     """Critical gains over the control period [s], other times as they are."""
-    period = np.linspace(_SHORTEST, _SPREAD, _SAMPLES) * study.period
+    # a period much shorter than the delay has so many commands on their way that the curve takes minutes
+    shortest = max(_SHORTEST * study.period, study.delay / _MOST)
+    period = np.linspace(shortest, max(_SPREAD * study.period, 2.0 * shortest), _SAMPLES)
     linear = study.linear(points)
     return Curve(period, np.stack([study.gain_margin(study.close(linear, period=x)) for x in period.tolist()]))
 

@@ -1,4 +1,4 @@
-"""When a scenario's samples are taken and its torques act, joint by joint, from its loop settings."""
+"""When a scenario's samples are taken and its torques act, as they do and as the controller believes."""
 
 from typing import Any
 
@@ -6,10 +6,15 @@ import numpy as np
 
 from lwa4d_sim.assembly import build_blocks
 from lwa4d_sim.channels import Transport
+from lwa4d_sim.errors import ScenarioError
+from lwa4d_sim.estimators import kalman_gain
 from lwa4d_sim.frame_log import FrameLog
-from lwa4d_sim.interfaces import NS_PER_S, Array
+from lwa4d_sim.interfaces import NS_PER_S, Array, Ns
+from lwa4d_sim.lateness import horizons, schedule_of
+from lwa4d_sim.observers import ObserverVelocity
 from lwa4d_sim.scenario import Scenario
-from lwa4d_sim.settings import CanopenLoop, SampledLoop
+from lwa4d_sim.settings import CanopenLoop, SampledLoop, Settings
+from lwa4d_sim.stability.assist import Assist
 from lwa4d_sim.stability.sampled import Instants
 
 # A latency this close to a whole number of periods is that number; arrival at the very instant counts as arrived.
@@ -91,3 +96,34 @@ def bus_arrivals(scenario: Scenario, variant: str) -> Array:
         since = log.received[rows] - log.queued[rows] // period * period
         late[j] = since.max() / NS_PER_S if since.size else period / NS_PER_S
     return late
+
+
+def assist_of(settings: Settings, n: int, phase: Ns) -> Assist | None:
+    """Observers and predictor, with the instants that they believe in; None without any.
+
+    Args:
+        settings: of a loop with a bus.
+        n: number of joints.
+        phase: from a sample to the computation [ns].
+
+    Raises:
+        ScenarioError: nobody can know when commands act.
+    """
+    loop: Any = settings.loop
+    compensation, velocity = settings.compensation, loop.velocity
+    observed = isinstance(velocity, ObserverVelocity)
+    if compensation is None and not observed:
+        return None
+    schedule, horizon = schedule_of([settings]), horizons([settings])
+    if schedule.acts is None:
+        raise ScenarioError(
+            "has no linear model where each command acts when it arrives over the bus; use loop.actuation next_sync"
+        )
+    disturbance = None if compensation is None else compensation.disturbance_observer
+    return Assist(
+        acts=np.broadcast_to(schedule.acts[0] / NS_PER_S, (n,)),
+        gain=kalman_gain(loop.period, velocity.acceleration, velocity.position) if observed else None,
+        due=float(schedule.due(phase).min()) / NS_PER_S,
+        horizon=None if horizon is None else float(horizon.min()) / NS_PER_S,
+        bandwidth=None if disturbance is None else disturbance.bandwidth,
+    )

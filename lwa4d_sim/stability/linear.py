@@ -8,7 +8,7 @@ import numpy as np
 
 from lwa4d_sim.controllers import CustomController
 from lwa4d_sim.dynamics import NominalModel
-from lwa4d_sim.errors import LwaError, ScenarioError
+from lwa4d_sim.errors import ScenarioError
 from lwa4d_sim.interfaces import ArmModel, Array, Controller, IntArray, JointReference, JointState, TaskReference
 
 # Step of the central differences [rad, rad/s]: truncation 1e-12 and rounding 1e-10 of the slopes are alike (derived).
@@ -115,11 +115,9 @@ def linearise_law(
     try:
         tau = controller.torque(JointState(*rows), repeated, model)
         again = controller.torque(JointState(*rows), repeated, model) if own else tau
-    except LwaError:
-        raise
-    except Exception as error:  # a user's own may raise anything
-        failed = f"torque() fails for {len(rows[0])} arms at once: {type(error).__name__}: {error}"
-        raise ScenarioError(f"{failed}; a law with a memory, or for one arm only, cannot be linearised") from error
+    except ScenarioError as error:
+        rule = f"it was asked for {len(rows[0])} arms at once, and a law with a memory, or for one arm, has no slope"
+        raise ScenarioError(f"{error}; {rule}" if own else str(error), key=error.key) from error
     if not np.array_equal(tau, again, equal_nan=True):
         rule = "torque() answers differently when asked the same again; a law with a memory cannot be linearised"
         raise ScenarioError(rule)

@@ -11,16 +11,14 @@ import numpy as np
 from lwa4d_sim.assembly import Blocks, build_blocks, build_controller
 from lwa4d_sim.dynamics import NominalModel
 from lwa4d_sim.errors import ScenarioError
-from lwa4d_sim.estimators import kalman_gain
 from lwa4d_sim.interfaces import NS_PER_S, Array, Controller, IntArray
-from lwa4d_sim.lateness import horizons, schedule_of
 from lwa4d_sim.mjcf import load_model
 from lwa4d_sim.observers import ObserverVelocity
 from lwa4d_sim.scenario import Scenario
 from lwa4d_sim.settings import CanopenLoop, IdealLoop, SampledLoop
 from lwa4d_sim.stability.assist import Assist
 from lwa4d_sim.stability.filters import Filter, filter_of
-from lwa4d_sim.stability.instants import bus_arrivals, bus_instants, instants_of
+from lwa4d_sim.stability.instants import assist_of, bus_arrivals, bus_instants, instants_of
 from lwa4d_sim.stability.jitter import continuous_delay_margin, jitter_margin
 from lwa4d_sim.stability.linear import (
     Linear,
@@ -65,8 +63,7 @@ class Study:
             self._make_law()
         self._arms: dict[tuple[str, int], NominalModel] = {}
         if isinstance(self.loop_settings, SampledLoop):
-            instants = self._instants(self.loop_settings, 0.0)
-            late = float((instants.old + instants.acts / instants.period).max())
+            late = self.delay / self._sampled.period
             if late > _LATEST:
                 rule = f"data are {late:.0f} periods late in all; the linear loop takes {_LATEST}"
                 raise scenario.error(("loop", "latency"), rule, variant)
@@ -105,25 +102,8 @@ class Study:
         return getattr(self.loop_settings, "velocity", None)
 
     def _assist(self, loop: Any) -> Assist | None:
-        """Observers and predictor, with the instants that they believe in."""
-        compensation, velocity = self.settings.compensation, loop.velocity
-        observed = isinstance(velocity, ObserverVelocity)
-        if compensation is None and not observed:
-            return None
-        settings = replace(self.settings, loop=loop)
         with self.blocks.about("compensation"):
-            schedule, horizon = schedule_of([settings]), horizons([settings])
-        if schedule.acts is None:
-            rule = "has no linear model where each command acts when it arrives over the bus; use actuation: next_sync"
-            raise self.scenario.error(("compensation",), rule, self.variant)
-        disturbance = None if compensation is None else compensation.disturbance_observer
-        return Assist(
-            acts=np.broadcast_to(schedule.acts[0] / NS_PER_S, (self.n,)),
-            gain=kalman_gain(loop.period, velocity.acceleration, velocity.position) if observed else None,
-            due=float(schedule.due(self.blocks.timing.phase).min()) / NS_PER_S,
-            horizon=None if horizon is None else float(horizon.min()) / NS_PER_S,
-            bandwidth=None if disturbance is None else disturbance.bandwidth,
-        )
+            return assist_of(replace(self.settings, loop=loop), self.n, self.blocks.timing.phase)
 
     @cached_property
     def _arrivals(self) -> Array:
@@ -279,6 +259,14 @@ class Study:
     def waits_for_sync(self) -> bool:
         """Whether torques act at a SYNC."""
         return not self.ideal and self._sampled.actuation == "next_sync"
+
+    @property
+    def delay(self) -> float:
+        """From a sample to the torque computed from it, the slowest joint's [s]; 0 without a bus."""
+        if self.ideal:
+            return 0.0
+        instants = self._instants(self._sampled, 0.0)
+        return float((instants.old * instants.period + instants.acts).max())
 
     @cached_property
     def slack(self) -> float:
