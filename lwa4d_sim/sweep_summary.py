@@ -7,7 +7,7 @@ from lwa4d_sim.sweep_design import WorstCase
 from lwa4d_sim.sweep_file import Sweep
 from lwa4d_sim.sweep_search import duration, score
 from lwa4d_sim.sweep_statistics import wilson
-from lwa4d_sim.sweep_table import read
+from lwa4d_sim.sweep_table import columns, metric_of, read
 
 
 def summarise(sweep: Sweep, folder: Folder) -> dict[str, Any]:
@@ -17,7 +17,7 @@ def summarise(sweep: Sweep, folder: Folder) -> dict[str, Any]:
         ``{"name", "folder", "table", "runs", "stable", "errors", "error", "pass_rate": {"estimate", "low", "high"},
         "worst": {NAME: {"run", "point", "metric", "value"}}}``.
     """
-    rows = read(folder.table).to_pylist()
+    rows = _rows(sweep, folder)
     good = [row for row in rows if row["status"] == "ok"]
     bad = [row for row in rows if row["status"] != "ok"]
     stable = [row for row in good if row["stable"]]
@@ -33,6 +33,16 @@ def summarise(sweep: Sweep, folder: Folder) -> dict[str, Any]:
         "pass_rate": {"estimate": len(stable) / len(good) if good else None, "low": low, "high": high},
         "worst": _worst(sweep, good, stable),
     }
+
+
+def _rows(sweep: Sweep, folder: Folder) -> list[dict[str, Any]]:
+    """The runs, with the columns that are asked for here; with all of them a long sweep takes ten times the memory."""
+    design = sweep.settings.design
+    measure = design.objective if isinstance(design, WorstCase) else "max_error"
+    wanted = {"run", "status", "message", "stable", "unstable_since", "diverged_at", *sweep.axes}
+    names = [name for name in columns(folder.table) if name in wanted or metric_of(name) == measure]
+    rows: list[dict[str, Any]] = read(folder.table, names).to_pylist()
+    return rows
 
 
 def _worst(sweep: Sweep, good: list[dict[str, Any]], stable: list[dict[str, Any]]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from lwa4d_sim.sweep_file import Point
 
 Row = Mapping[str, Any]
 _GROUP = 65_536  # rows of a row group; fixed, so that a table's bytes do not depend on how it came about
+_AT_ONCE = 32  # parts held open before they are put together (assumed)
 _OUTCOME = ("status", "message")
 
 
@@ -40,8 +41,7 @@ def merge(paths: Iterable[Path], points: Sequence[Point]) -> Any:
 
     runs = {point.run for point in points}
     asked = set(_described(points))
-    tables = [table.drop_columns([n for n in table.column_names if n in asked]) for table in map(read, paths)]
-    table = pa.concat_tables(tables, promote_options="default")
+    table = pa.concat_tables(_gathered(map(read, paths), asked), promote_options="default").combine_chunks()
     table = table.sort_by([("run", "ascending"), ("status", "descending"), ("message", "ascending")])
     number = table["run"].to_pylist()
     keep = [run in runs and (k == 0 or number[k - 1] != run) for k, run in enumerate(number)]
@@ -50,6 +50,18 @@ def merge(paths: Iterable[Path], points: Sequence[Point]) -> Any:
     names = _ordered(set(table.column_names) - {"run", *_OUTCOME})
     columns = {name: table[name].combine_chunks() for name in ("run", *names, *_OUTCOME)}
     return _joined(columns, sorted((point for point in points if point.run in present), key=lambda point: point.run))
+
+
+def _gathered(tables: Iterable[Any], asked: set[str]) -> list[Any]:
+    """The tables without the columns ``asked``, some together at a time: many small ones take much room."""
+    import pyarrow as pa
+
+    made: list[Any] = []
+    for table in tables:
+        made.append(table.drop_columns([name for name in table.column_names if name in asked]))
+        if len(made) > _AT_ONCE:
+            made = [pa.concat_tables(made, promote_options="default").combine_chunks()]
+    return made
 
 
 def _joined(columns: Mapping[str, Any], points: Sequence[Point]) -> Any:
@@ -136,13 +148,34 @@ def read(path: Path, columns: Sequence[str] | None = None) -> Any:
     Raises:
         RecordError: it cannot be read.
     """
+    try:
+        # threads would each keep some memory, and the tables are small
+        return _opened(path).read(None if columns is None else list(columns), use_threads=False)
+    except (OSError, ValueError) as error:
+        raise _unreadable(path, error) from error
+
+
+def _opened(path: Path) -> Any:
     import pyarrow.parquet as pq
 
     try:
-        # a file, not a data set: folders called key=value must not become columns
-        return pq.ParquetFile(path).read(None if columns is None else list(columns))
+        return pq.ParquetFile(path)  # a file, not a data set: folders called key=value must not become columns
     except (OSError, ValueError) as error:
-        raise RecordError(f"{path}: not a readable table ({error}); delete it and run the sweep again") from error
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> RecordError:
+    return RecordError(f"{path}: not a readable table ({error}); delete it and run the sweep again")
+
+
+def columns(path: Path) -> list[str]:
+    """Names of the columns of a table.
+
+    Raises:
+        RecordError: it cannot be read.
+    """
+    names: list[str] = _opened(path).schema_arrow.names
+    return names
 
 
 def made(table: Any) -> Any:
