@@ -36,9 +36,9 @@ def stability(
     Example: lwa4d-sim stability pd_joint_p2.5 -o runs
     """
     from lwa4d_sim.scenario import Scenario
-    from lwa4d_sim.stability_findings import CURVES, check_joints, find, points_as_objects, with_charts
-    from lwa4d_sim.stability_folder import claim_for, write_findings
-    from lwa4d_sim.stability_words import details, headline
+    from lwa4d_sim.stability.findings import CURVES, check_joints, find, points_as_objects, with_charts
+    from lwa4d_sim.stability.folder import claim_for, write_findings
+    from lwa4d_sim.stability.words import details, headline
 
     scenario = Scenario.load(scenario_path(file), dict(override(text) for text in overrides or []))
     folder = None if no_plots else claim_for(scenario, out)
@@ -84,7 +84,7 @@ def _print_table(found: Any) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from lwa4d_sim.stability_words import factor, milliseconds, radius, unstable
+    from lwa4d_sim.stability.words import factor, milliseconds, radius, unstable
 
     columns = (
         "",

@@ -30,11 +30,11 @@ def sweep(
     Example: lwa4d-sim sweep gain_latency -j 4 -o runs
     """
     from lwa4d_sim.batch import default_workers
-    from lwa4d_sim.sweep import Watch, processes, run_sweep, spell
-    from lwa4d_sim.sweep_file import Sweep
-    from lwa4d_sim.sweep_run import Cost
-    from lwa4d_sim.sweep_summary import summarise
-    from lwa4d_sim.sweep_workers import Processes, Workers
+    from lwa4d_sim.sweep.file import Sweep
+    from lwa4d_sim.sweep.folder import Watch, processes, run_sweep, spell
+    from lwa4d_sim.sweep.summary import summarise
+    from lwa4d_sim.sweep.tasks import Cost
+    from lwa4d_sim.sweep.workers import Processes, Workers
 
     class Bar(Watch):
         """A progress bar on the terminal, or a line where nobody watches."""
@@ -60,7 +60,7 @@ def sweep(
     if cluster is None:
         workers = Processes(jobs or default_workers())
     else:
-        from lwa4d_sim.sweep_cluster import Cluster
+        from lwa4d_sim.sweep.cluster import Cluster
 
         workers = Cluster(cluster)
     with ExitStack() as stack:
@@ -68,8 +68,8 @@ def sweep(
         folder = run_sweep(made, out, workers, limit=limit, fresh=fresh, watch=Bar(stack))
     summary: dict[str, Any] = summarise(made, folder)
     if not no_plots:
-        from lwa4d_sim.sweep_report import report
-        from lwa4d_sim.sweep_theory import stability_limit
+        from lwa4d_sim.sweep.report import report
+        from lwa4d_sim.sweep.theory import stability_limit
 
         with busy("drawing", quiet=as_json):
             summary["report"] = str(report(made, folder, summary, stability_limit(made)))

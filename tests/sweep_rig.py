@@ -7,10 +7,10 @@ from typing import Any
 import pyarrow.parquet as pq
 
 from lwa4d_sim.errors import SweepError
-from lwa4d_sim.sweep import Folder, run_sweep
-from lwa4d_sim.sweep_file import Sweep
-from lwa4d_sim.sweep_work import Task, work
-from lwa4d_sim.sweep_workers import Done, Workers
+from lwa4d_sim.sweep.file import Sweep
+from lwa4d_sim.sweep.folder import Folder, run_sweep
+from lwa4d_sim.sweep.work import Task, work
+from lwa4d_sim.sweep.workers import Done, Workers
 
 SCENARIO: dict[str, Any] = {
     "name": "small",

@@ -15,13 +15,14 @@ import pytest
 import yaml
 from PIL import Image
 
-from lwa4d_sim import cli, stability_folder, stability_guides
+from lwa4d_sim import cli
 from lwa4d_sim.errors import RecordError
 from lwa4d_sim.scenario import Scenario
+from lwa4d_sim.stability import folder, guides
 from lwa4d_sim.stability.analysis import PointStability
+from lwa4d_sim.stability.findings import CURVES, Findings, find, with_charts
 from lwa4d_sim.stability.margins import Mode
-from lwa4d_sim.stability_findings import CURVES, Findings, find, with_charts
-from lwa4d_sim.stability_words import headline, moves
+from lwa4d_sim.stability.words import headline, moves
 
 PAGE = (Path(__file__).parent.parent / "docs" / "stability.md").read_text(encoding="utf-8")
 SMALL: dict[str, Any] = {
@@ -143,7 +144,7 @@ def test_everything_is_written(call: Call, tmp_path: Path) -> None:
     page = (folder / "report.html").read_text()
     assert data["verdict"] in page
     text = re.sub(r"\s+", " ", page)
-    for guide in (stability_guides.LATENCY, stability_guides.PERIOD, stability_guides.POLES, stability_guides.MODES):
+    for guide in (guides.LATENCY, guides.PERIOD, guides.POLES, guides.MODES):
         assert guide in text
     assert page.count("<figure>") == len(PICTURES)
     assert "http" not in re.sub(r"data:image/png;base64,[\w+/=]+", "", page)
@@ -219,7 +220,7 @@ def test_the_folder_is_whole_or_not_there(call: Call, tmp_path: Path, monkeypatc
     def full(*_: Any) -> None:
         raise RecordError("disk full")
 
-    monkeypatch.setattr(stability_folder, "write_stability_page", full)
+    monkeypatch.setattr(folder, "write_stability_page", full)
     result = call("small.yaml", "--size", "3", "-o", "out")
     assert (result.code, result.out) == (2, "")
     assert "disk full" in result.err

@@ -14,13 +14,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sweep_rig import AXES, Here, finish, load, rows, write
 
-from lwa4d_sim import sweep_run
 from lwa4d_sim.errors import RecordError, ScenarioError, SweepError
 from lwa4d_sim.lockstep import group
 from lwa4d_sim.metrics import METRICS
 from lwa4d_sim.runner import run
 from lwa4d_sim.scenario import Scenario
-from lwa4d_sim.sweep import spell
+from lwa4d_sim.sweep import tasks as sweep_run
+from lwa4d_sim.sweep.folder import spell
 
 RUNS = 24  # of the axes in sweep_rig
 

@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 from sweep_rig import finish, rows, write
 
-from lwa4d_sim import sweep_cluster
 from lwa4d_sim.errors import SweepError
-from lwa4d_sim.sweep_cluster import Cluster
-from lwa4d_sim.sweep_work import environment
+from lwa4d_sim.sweep import cluster as sweep_cluster
+from lwa4d_sim.sweep.cluster import Cluster
+from lwa4d_sim.sweep.work import environment
 
 pytestmark = pytest.mark.slow  # a cluster needs some seconds to start
 ROOT = Path(__file__).parent.parent

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from lwa4d_sim.sweep_design import (
+from lwa4d_sim.sweep.design import (
     Axis,
     Grid,
     LatinHypercube,
@@ -20,7 +20,7 @@ from lwa4d_sim.sweep_design import (
     SobolDesign,
     ValuesAxis,
 )
-from lwa4d_sim.sweep_statistics import wilson
+from lwa4d_sim.sweep.statistics import wilson
 
 counts = st.integers(1, 6)
 

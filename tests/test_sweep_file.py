@@ -9,8 +9,8 @@ from sweep_rig import AXES, load, write
 
 from lwa4d_sim.console import shipped_scenarios
 from lwa4d_sim.errors import LwaError, ScenarioError
+from lwa4d_sim.sweep.file import Sweep, SweepSettings
 from lwa4d_sim.sweep_cli import shipped_sweeps, sweep_path
-from lwa4d_sim.sweep_file import Sweep, SweepSettings
 
 P = {"from": 1, "to": 2, "count": 3, "keys": {"controller.kp": 1}}
 WRONG: list[tuple[dict[str, Any], str]] = [

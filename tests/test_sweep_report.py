@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from sweep_rig import AXES, finish, load, write
 
 from lwa4d_sim.drawing import BLACK
-from lwa4d_sim.sweep_plots import BAD, GOOD, Runs, draw_heat_map, draw_sweep, labelled
-from lwa4d_sim.sweep_report import report
-from lwa4d_sim.sweep_summary import summarise
+from lwa4d_sim.sweep.plots import BAD, GOOD, Runs, draw_heat_map, draw_sweep, labelled
+from lwa4d_sim.sweep.report import report
+from lwa4d_sim.sweep.summary import summarise
 
 MAP = {"p": AXES["p"], "loop.latency": {"from": 0, "to": 0.012, "count": 5}}
 
@@ -69,8 +69,8 @@ def test_where_nothing_could_be_made_there_is_still_a_page(tmp_path: Path) -> No
     sweep, folder = load(path), finish(path, tmp_path / "out")
     for part in folder.parts():
         part.unlink()
-    from lwa4d_sim import sweep_table
-    from lwa4d_sim.sweep_work import failure
+    from lwa4d_sim.sweep import table as sweep_table
+    from lwa4d_sim.sweep.work import failure
 
     points = list(sweep.points())
     sweep_table.write(folder.table, sweep_table.part(points, [failure(point.run, "broken") for point in points]))

@@ -9,9 +9,9 @@ import pytest
 from sweep_rig import Here, finish, load, rows, write
 
 from lwa4d_sim.errors import ScenarioError
-from lwa4d_sim.sweep_file import Point
-from lwa4d_sim.sweep_search import duration, score, search
-from lwa4d_sim.sweep_summary import summarise
+from lwa4d_sim.sweep.file import Point
+from lwa4d_sim.sweep.search import duration, score, search
+from lwa4d_sim.sweep.summary import summarise
 
 REGION: dict[str, Any] = {"controller.kp": {"from": 10, "to": 40}, "plant.payload.mass": {"from": 0.01, "to": 3}}
 

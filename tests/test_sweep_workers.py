@@ -12,9 +12,9 @@ import pytest
 from sweep_rig import Here, finish, load, rows, write
 
 from lwa4d_sim.errors import SweepError
-from lwa4d_sim.sweep_run import task_of
-from lwa4d_sim.sweep_work import Task, check_versions, environment, work
-from lwa4d_sim.sweep_workers import Processes
+from lwa4d_sim.sweep.tasks import task_of
+from lwa4d_sim.sweep.work import Task, check_versions, environment, work
+from lwa4d_sim.sweep.workers import Processes
 
 ROOT = Path(__file__).parent.parent
 LAW = """
@@ -168,7 +168,7 @@ def test_workers_that_cannot_start_are_told_of_once(tmp_path: Path) -> None:
     (script := tmp_path / "script.py").write_text(
         f"import sys\nsys.path[:0] = {paths!r}\n"
         "from pathlib import Path\nfrom lwa4d_sim.errors import SweepError\nfrom sweep_rig import finish\n"
-        "from lwa4d_sim.sweep_workers import Processes\n"
+        "from lwa4d_sim.sweep.workers import Processes\n"
         f"try:\n    finish(Path({str(path)!r}), Path({str(tmp_path / 'out')!r}), Processes(1))\n"
         "except SweepError as error:\n    print(error)\n"
     )

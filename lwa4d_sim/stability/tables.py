@@ -9,9 +9,9 @@ import numpy as np
 
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.stability.analysis import Curve
+from lwa4d_sim.stability.findings import Charts, Findings
 from lwa4d_sim.stability.maps import Slice
 from lwa4d_sim.stability.motion import Course
-from lwa4d_sim.stability_findings import Charts, Findings
 
 
 def write_tables(found: Findings, charts: Charts, folder: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from lwa4d_sim.errors import RecordError
 from lwa4d_sim.metrics import FLAGS, METRICS
-from lwa4d_sim.sweep_file import Point
+from lwa4d_sim.sweep.file import Point
 
 Row = Mapping[str, Any]
 _GROUP = 65_536  # rows of a row group; fixed, so that a table's bytes do not depend on how it came about

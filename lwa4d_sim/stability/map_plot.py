@@ -13,12 +13,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from lwa4d_sim import stability_guides as guides
 from lwa4d_sim.drawing import BLACK, GREY, LOOK, PALETTE, SMALL, Picture, save
 from lwa4d_sim.interfaces import Array
+from lwa4d_sim.stability import guides as guides
+from lwa4d_sim.stability.findings import Charts, Findings
 from lwa4d_sim.stability.maps import Slice
-from lwa4d_sim.stability_findings import Charts, Findings
-from lwa4d_sim.stability_plots import canvas
+from lwa4d_sim.stability.plots import canvas
 
 NOWHERE = "#d0d0d0"  # no limit, or none worth a colour
 _COLOURS: tuple[str, ...] = (

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lwa4d_sim import sweep_table as tables
 from lwa4d_sim.errors import RecordError, SweepError
-from lwa4d_sim.sweep_design import WorstCase
-from lwa4d_sim.sweep_file import Point, Sweep
-from lwa4d_sim.sweep_run import FIRST, Cost, cut, groups, task_of, work_off
-from lwa4d_sim.sweep_search import search
-from lwa4d_sim.sweep_work import Answer, environment
-from lwa4d_sim.sweep_workers import Workers
+from lwa4d_sim.sweep import table as tables
+from lwa4d_sim.sweep.design import WorstCase
+from lwa4d_sim.sweep.file import Point, Sweep
+from lwa4d_sim.sweep.search import search
+from lwa4d_sim.sweep.tasks import FIRST, Cost, cut, groups, task_of, work_off
+from lwa4d_sim.sweep.work import Answer, environment
+from lwa4d_sim.sweep.workers import Workers
 
 LIMIT = 20_000  # runs, unless the user asks for more
 TABLE, PARTS, ABOUT, COPY, WORST = "runs.parquet", "parts", "sweep.json", "sweep.yaml", "worst"

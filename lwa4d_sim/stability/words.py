@@ -6,7 +6,7 @@ import numpy as np
 
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.stability.analysis import PointStability
-from lwa4d_sim.stability_findings import STILL, Findings
+from lwa4d_sim.stability.findings import STILL, Findings
 
 _NAMED = 0.5  # a joint that moves at least this share of the largest is named (assumed)
 

@@ -5,8 +5,8 @@ import numpy as np
 from lwa4d_sim.errors import LwaError
 from lwa4d_sim.settings import IdealLoop
 from lwa4d_sim.stability.boundary import critical_value
-from lwa4d_sim.sweep_design import RangeAxis
-from lwa4d_sim.sweep_file import Sweep
+from lwa4d_sim.sweep.design import RangeAxis
+from lwa4d_sim.sweep.file import Sweep
 
 Curve = list[tuple[float, float]]
 

@@ -5,12 +5,12 @@ from pathlib import Path
 
 from lwa4d_sim.folders import claim, written_whole
 from lwa4d_sim.scenario import Scenario
-from lwa4d_sim.stability_findings import Findings, record
-from lwa4d_sim.stability_map import draw_map
-from lwa4d_sim.stability_plots import draw_findings
-from lwa4d_sim.stability_report import write_stability_page
-from lwa4d_sim.stability_tables import write_tables
-from lwa4d_sim.stability_words import details, headline
+from lwa4d_sim.stability.findings import Findings, record
+from lwa4d_sim.stability.map_plot import draw_map
+from lwa4d_sim.stability.plots import draw_findings
+from lwa4d_sim.stability.report import write_stability_page
+from lwa4d_sim.stability.tables import write_tables
+from lwa4d_sim.stability.words import details, headline
 
 _OURS = (".csv", ".html", ".json", ".png")  # what such a folder may hold, and what the next one replaces
 

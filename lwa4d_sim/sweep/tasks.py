@@ -6,9 +6,9 @@ from operator import itemgetter
 from typing import Any, NamedTuple
 
 from lwa4d_sim.lockstep import group, pace
-from lwa4d_sim.sweep_file import Point, Sweep
-from lwa4d_sim.sweep_work import Answer, Task, environment, failure
-from lwa4d_sim.sweep_workers import Workers
+from lwa4d_sim.sweep.file import Point, Sweep
+from lwa4d_sim.sweep.work import Answer, Task, environment, failure
+from lwa4d_sim.sweep.workers import Workers
 
 TRIES = 3  # before a run is given up
 # Runs stepped together (assumed): few waste Python's time on every tick, many lose much when a worker dies and leave

@@ -20,7 +20,7 @@ from lwa4d_sim.mjcf import model_path
 from lwa4d_sim.scenario import NAME_RULE, Scenario, can_name_a_file, read_text
 from lwa4d_sim.schema import Misfit, fit
 from lwa4d_sim.settings import CanopenLoop
-from lwa4d_sim.sweep_design import Axis, Design, Grid, RangeAxis, WorstCase
+from lwa4d_sim.sweep.design import Axis, Design, Grid, RangeAxis, WorstCase
 from lwa4d_sim.trajectories import SampledMotion
 from lwa4d_sim.yaml_text import parse
 

@@ -11,8 +11,8 @@ from typing import Any
 
 from lwa4d_sim.documents import one_line
 from lwa4d_sim.errors import SweepError
-from lwa4d_sim.sweep_work import Task, check_versions, environment, work
-from lwa4d_sim.sweep_workers import Done
+from lwa4d_sim.sweep.work import Task, check_versions, environment, work
+from lwa4d_sim.sweep.workers import Done
 
 _CONNECT = 6.0  # [s] a scheduler in reach answers within a fraction of one
 _SILENCE = 6.0  # [s] without a connection after which the scheduler is taken for gone

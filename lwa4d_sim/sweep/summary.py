@@ -2,12 +2,12 @@
 
 from typing import Any
 
-from lwa4d_sim.sweep import Folder
-from lwa4d_sim.sweep_design import WorstCase
-from lwa4d_sim.sweep_file import Sweep
-from lwa4d_sim.sweep_search import duration, score
-from lwa4d_sim.sweep_statistics import wilson
-from lwa4d_sim.sweep_table import columns, metric_of, read
+from lwa4d_sim.sweep.design import WorstCase
+from lwa4d_sim.sweep.file import Sweep
+from lwa4d_sim.sweep.folder import Folder
+from lwa4d_sim.sweep.search import duration, score
+from lwa4d_sim.sweep.statistics import wilson
+from lwa4d_sim.sweep.table import columns, metric_of, read
 
 
 def summarise(sweep: Sweep, folder: Folder) -> dict[str, Any]:

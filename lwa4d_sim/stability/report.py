@@ -10,9 +10,9 @@ from lwa4d_sim.assembly import versions
 from lwa4d_sim.drawing import Picture
 from lwa4d_sim.page import write_page
 from lwa4d_sim.settings import CanopenLoop, IdealLoop
+from lwa4d_sim.stability.findings import Findings
 from lwa4d_sim.stability.maps import default_joints
-from lwa4d_sim.stability_findings import Findings
-from lwa4d_sim.stability_words import details, factor, headline, milliseconds, radius, unstable
+from lwa4d_sim.stability.words import details, factor, headline, milliseconds, radius, unstable
 
 _SIZE = 50  # of a map that no option made larger or smaller
 

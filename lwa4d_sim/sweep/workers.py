@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 from lwa4d_sim.batch import deaf
 from lwa4d_sim.errors import SweepError
-from lwa4d_sim.sweep_work import Answer, Task, work
+from lwa4d_sim.sweep.work import Answer, Task, work
 
 _STILLBORN = 3  # processes in a row that end before they begin
 _CANNOT_START = (

@@ -14,12 +14,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from lwa4d_sim import stability_guides as guides
 from lwa4d_sim.drawing import BLACK, GREY, LOOK, PALETTE, SMALL, WIDTH, Picture, plain, save
 from lwa4d_sim.interfaces import Array
+from lwa4d_sim.stability import guides as guides
 from lwa4d_sim.stability.analysis import Curve
-from lwa4d_sim.stability_findings import Charts, Findings
-from lwa4d_sim.stability_words import unstable
+from lwa4d_sim.stability.findings import Charts, Findings
+from lwa4d_sim.stability.words import unstable
 
 SAFE = "#e3eef7"  # where the loop is stable at every point
 TICKS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100)

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from lwa4d_sim.drawing import BLACK, GREY, LOOK, PALETTE, SMALL, Picture, canvas, plain, save
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.metrics import METRICS
-from lwa4d_sim.sweep_statistics import wilson
+from lwa4d_sim.sweep.statistics import wilson
 
 GOOD, BAD = PALETTE[0], PALETTE[1]
 MAPPED = ("rms_error", "max_error", "vibration")  # metrics that get a map

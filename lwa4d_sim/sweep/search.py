@@ -9,9 +9,9 @@ import numpy as np
 from lwa4d_sim.errors import LwaError
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.metrics import METRICS
-from lwa4d_sim.sweep_design import WorstCase, mapped
-from lwa4d_sim.sweep_file import Point, Sweep
-from lwa4d_sim.sweep_table import metric_of
+from lwa4d_sim.sweep.design import WorstCase, mapped
+from lwa4d_sim.sweep.file import Point, Sweep
+from lwa4d_sim.sweep.table import metric_of
 
 Evaluate = Callable[[Sequence[Point]], list[Mapping[str, Any]]]
 _MEMBERS = 10  # of a population for each axis (Storn and Price 1997 advise ten)

@@ -13,12 +13,12 @@ import numpy as np
 from lwa4d_sim.metrics import FLAGS, METRICS
 from lwa4d_sim.page import write_page
 from lwa4d_sim.results import run_scenario
-from lwa4d_sim.sweep import WORST, Folder
-from lwa4d_sim.sweep_design import RangeAxis, WorstCase
-from lwa4d_sim.sweep_file import Sweep
-from lwa4d_sim.sweep_plots import Curve, Runs, draw_sweep
-from lwa4d_sim.sweep_table import made, metric_of, read
-from lwa4d_sim.sweep_work import environment
+from lwa4d_sim.sweep.design import RangeAxis, WorstCase
+from lwa4d_sim.sweep.file import Sweep
+from lwa4d_sim.sweep.folder import WORST, Folder
+from lwa4d_sim.sweep.plots import Curve, Runs, draw_sweep
+from lwa4d_sim.sweep.table import made, metric_of, read
+from lwa4d_sim.sweep.work import environment
 
 _PERCENTILES = (0, 50, 95, 99, 100)
 
@@ -29,8 +29,8 @@ def report(sweep: Sweep, folder: Folder, summary: Mapping[str, Any], boundary: C
     Args:
         sweep: what was run.
         folder: where its table is.
-        summary: see `sweep_summary.summarise`.
-        boundary: a curve over the maps; see `sweep_plots.draw_heat_map`.
+        summary: see `sweep.summary.summarise`.
+        boundary: a curve over the maps; see `sweep.plots.draw_heat_map`.
 
     Raises:
         RecordError: something cannot be written.
