@@ -25,7 +25,7 @@ _SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 _RANGE = (1e-3, 1e3)  # of the gains that are tried, as factors on the scenario's own
 _STEP = 0.1  # of the logarithm of a common factor; a narrower window of good gains is missed (assumed)
 _EVALUATIONS = {"two": 60, "joints": 150}  # at most, by number of gains (assumed: seconds to a minute)
-_SIMULATIONS = 60  # at most, where each evaluation is a run
+_SIMULATIONS = 40  # at most, where each evaluation is a run
 _RATIOS = (1.0, 1.2, 1.5, 2.0)  # damping ratios from which the joints' gains are searched (assumed)
 _WORKSPACE = (8, 8)  # poses of a workspace that are looked at
 

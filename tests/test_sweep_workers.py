@@ -127,8 +127,8 @@ def begun(path: Path, out: Path, laws: Path, *more: str) -> "subprocess.Popen[st
 
 
 def slow(laws: str, folder: Path) -> Path:
-    """A sweep of 40 runs, each of half a second, one at a time, for they differ in their law."""
-    axes = {"controller.kp": {"from": 5, "to": 20, "count": 40}}
+    """A sweep of 16 runs, each of half a second, one at a time, for they differ in their law."""
+    axes = {"controller.kp": {"from": 5, "to": 20, "count": 16}}
     return write(folder, own(laws, folder, "slow"), axes=axes)
 
 
@@ -156,9 +156,9 @@ def test_an_interrupted_sweep_goes_on_where_it_was(how: signal.Signals, laws: st
     (tmp_path / "small.yaml").write_text((tmp_path / "small.yaml").read_text())
     here = Here()
     table = rows(finish(path, out, here))
-    assert len(table) == 40
+    assert len(table) == 16
     assert {row["status"] for row in table} == {"ok"}
-    assert 0 < sum(map(len, here.tasks)) < 40
+    assert 0 < sum(map(len, here.tasks)) < 16
 
 
 def test_workers_that_cannot_start_are_told_of_once(tmp_path: Path) -> None:
