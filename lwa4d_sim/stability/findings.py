@@ -42,7 +42,6 @@ class Charts:
         poles: eigenvalues of the loop from tick to tick, (K, m); None without a bus.
         course: along the motion.
         map: over a slice of the workspace; None for an arm of one joint.
-        map_stable: whether the loop is stable in each pose of the map.
         alike: whether each operating point's joints that the slice leaves alone stand as on the map, the one about
             the vertical aside.
     """
@@ -53,8 +52,12 @@ class Charts:
     poles: Any
     course: Course
     map: Slice | None
-    map_stable: Any
     alike: Sequence[bool]
+
+    @property
+    def map_stable(self) -> Any:
+        """Whether the loop is stable in each pose of the map."""
+        return np.ones(0, bool) if self.map is None else self.map.spectral_radius <= 1.0 + STILL
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,7 @@ def with_charts(
     """
     study = found.study
     rows = sorted({*np.linspace(0, len(points.q) - 1, min(_DRAWN, len(points.q))).round().astype(int).tolist()})
-    some = Points(points.t[rows], points.q[rows], points.dq[rows], points.ddq[rows], _part(points.ref, rows))
+    some = points.part(np.array(rows))
     pair = check_joints(study, joints)
 
     def done(chart: _T) -> _T:
@@ -136,7 +139,6 @@ def with_charts(
         poles=None if study.ideal else np.linalg.eigvals(study.close(study.linear(some)).at_gain(np.ones(len(rows)))),
         course=done(along(study)),
         map=one,
-        map_stable=np.ones(0, bool) if one is None else one.spectral_radius <= 1.0 + STILL,
         alike=[pair is not None and _alike(study, q, pair) for q in points.q],
     )
     return Findings(study, found.points, found.names, found.remarks, found.poses, charts)
@@ -222,10 +224,6 @@ def _alike(study: Study, q: Array, pair: tuple[int, int]) -> bool:
     others = [j for j in range(int(upright), study.n) if j not in pair]
     same_side = (q[pair[1]] >= 0) == (here[pair[1]] >= 0)
     return bool(same_side and np.allclose(q[others], here[others], atol=1e-6))
-
-
-def _part(ref: Any, rows: Sequence[int]) -> Any:
-    return type(ref)(*(None if field is None else field[rows] for field in ref))
 
 
 def _finite(value: Any) -> float | None:

@@ -55,7 +55,7 @@ def along(study: Study) -> Course:
     P = len(points.t)
     radius, margin = loop.radius(np.arange(P), np.ones(P)), study.gain_margin(loop)
     worst = int(np.argmin(margin)) if radius.max() < 1.0 else int(np.argmax(radius))
-    return Course(points.t, points.q, radius, margin, worst, _floquet(study, t))
+    return Course(points.t, points.q, radius, margin, worst, _floquet(study))
 
 
 def path(study: Study, t: Array) -> Points:
@@ -76,7 +76,7 @@ def path(study: Study, t: Array) -> Points:
     return Points(t, log.q[rows], log.dq[rows], ddq[rows], study.along(t).ref)
 
 
-def _floquet(study: Study, t: Array) -> float | None:
+def _floquet(study: Study) -> float | None:
     """Growth per control period over one cycle of the motion; the arm is frozen in the middle of each period."""
     trajectory: Any = study.blocks.infos[0].trajectory
     if study.ideal or study.steps:
@@ -92,7 +92,8 @@ def _floquet(study: Study, t: Array) -> float | None:
     ticks = round(length / study.period)
     last = trajectory.duration - length  # the cycle in which what the start has stirred up is over
     at = last + np.arange(ticks) * (length / ticks)
-    here, middle = study.linear(path(study, at)), study.linear(path(study, at + 0.5 * length / ticks))
+    both = path(study, np.concatenate([at, at + 0.5 * length / ticks]))  # in one go: a PD law's path is a run
+    here, middle = (study.linear(both.part(slice(k * ticks, (k + 1) * ticks))) for k in (0, 1))
     matrices = study.close(here.with_arm(middle)).at_gain()
     product, grown = np.eye(matrices.shape[1]), 0.0
     for matrix in matrices:
