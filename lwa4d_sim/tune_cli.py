@@ -55,6 +55,8 @@ def tune(
 ) -> None:
     """Find the gains that make the loop fastest and still bear a stated margin; write them back as a scenario.
 
+    Exit code 1 when a run with them is not stable all the same.
+
     Example: lwa4d-sim tune pd_joint_p2.5 --gain-margin 2 --delay-margin 0.005 -o runs
     """
     from lwa4d_sim.scenario import Scenario
@@ -96,6 +98,7 @@ def tune(
         print(json.dumps(answer))
     else:
         _print(answer, wish.gains != "one" and float(found.after.peak[0]) > peak * 1.001)
+    raise typer.Exit(0 if runs["after"]["stable"] else 1)
 
 
 def _require(option: str, value: float, least: float, most: float) -> None:

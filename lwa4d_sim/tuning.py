@@ -94,6 +94,9 @@ class _Search:
         if not isinstance(given, (PdGravity, ComputedTorque)):
             rule = "its gains are not known; pd_gravity and computed_torque can be tuned"
             raise study.scenario.error(("controller", "kind"), rule, study.variant)
+        if study.ideal:
+            rule = "a loop without a bus has no largest gain; choose a variant with a bus"
+            raise study.scenario.error(("loop", "kind"), rule, study.variant)
         self._given = given
         kp, kd = given.gains if isinstance(given, ComputedTorque) else (given.kp, given.kd)
         size = study.n if given.space == "joint" else study.blocks.arm.task_size
@@ -233,7 +236,7 @@ class _Search:
             worst = max(worst, float(plain.radius(rows, factors).max()))
             if roughly and worst > 1.0:
                 return worst - 1.0
-        for share in _SHARES[1:] if wish.delay_margin and not study.ideal else ():
+        for share in _SHARES[1:] if wish.delay_margin else ():
             late = study.close(linear, share * wish.delay_margin)
             worst = max(worst, float(late.radius(rows, np.ones(len(rows))).max()))
             if roughly and worst > 1.0:

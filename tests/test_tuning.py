@@ -149,6 +149,10 @@ def test_relative_paths_still_lead_somewhere(call: Callable[..., Result], tmp_pa
         (["pd_joint_p2.5", "--gain-margin", "0.5"], "--gain-margin (=0.5): must be from 1 to 1000"),
         (["pd_joint_p2.5", "--gain-margin", "nan"], "--gain-margin (=nan): must be from 1 to 1000"),
         (["pd_joint_p2.5", "--delay-margin", "-1"], "--delay-margin (=-1): must be from 0 to 0.1"),
+        (
+            ["pd_joint_p2.5", "--variant", "ideal"],
+            "a loop without a bus has no largest gain; choose a variant with a bus",
+        ),
         (["pd_joint_p2.5", "--variant", "x"], "no variant 'x'; it has ideal, can"),
         (["pd_joint_p2.5", "--gains", "three"], "three"),
         (["nothing.yaml"], "nothing.yaml: cannot read the scenario"),
