@@ -10,8 +10,11 @@ from typing import Annotated, Any
 import typer
 
 from lwa4d_sim.bus_cli import bus_app
+from lwa4d_sim.calibrate_cli import calibrate
 from lwa4d_sim.console import Json, Out, Set, busy, complain, override, progress, scenario_path, shipped_scenarios
 from lwa4d_sim.errors import LwaError, ScenarioError
+from lwa4d_sim.excite_cli import excite
+from lwa4d_sim.identify_cli import identify
 from lwa4d_sim.stability_cli import stability
 from lwa4d_sim.sweep_cli import shipped_sweeps, sweep
 from lwa4d_sim.tune_cli import tune
@@ -30,6 +33,9 @@ app.add_typer(bus_app, name="bus")
 app.command()(stability)
 app.command()(sweep)
 app.command()(tune)
+app.command()(excite)
+app.command()(identify)
+app.command()(calibrate)
 
 
 @app.command()

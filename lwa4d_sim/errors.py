@@ -65,3 +65,16 @@ class BusError(LwaError, OSError):
 
 class SweepError(LwaError, ValueError):
     """A sweep cannot be started or cannot go on; what it has is kept."""
+
+
+class IdentificationError(LwaError, ValueError):
+    """Data cannot be read as a recording, or do not tell what was asked of them.
+
+    Args:
+        message: what is wrong and what would be valid.
+        key: dotted key of a scenario that it is about.
+    """
+
+    def __init__(self, message: str, key: str | None = None) -> None:
+        super().__init__(message)
+        self.key = key

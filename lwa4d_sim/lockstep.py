@@ -31,6 +31,7 @@ def common(settings: Settings) -> Mapping[str, Any]:
         "plant.integrator": plant.integrator,
         "plant.disturbances": plant.disturbances,
         "compensation": _switches(settings.compensation),
+        "controller.model.arm": settings.controller.model.arm,
         "controller.schedule": getattr(settings.controller, "schedule", None),
     }
     if isinstance(loop, SampledLoop):
@@ -65,8 +66,10 @@ def group(settings: Settings, run: int) -> str:
     motion, law = settings.trajectory, settings.controller
     if isinstance(motion, WaypointMotion):
         timing: Any = (motion.segment_time, len(motion.waypoints.points))
+    elif isinstance(motion, FourierMotion):
+        timing = (motion.lead_in, motion.duration, motion.lead_out)
     else:
-        timing = motion.duration if isinstance(motion, FourierMotion) else motion
+        timing = motion
     plain = ("payload", "friction", "armature")
     shape = [getattr(arm, name) is None for arm in (settings.plant, law.model) for name in plain]
     own = law if isinstance(law, CustomController) else (type(law).__name__, law.space)

@@ -222,6 +222,8 @@ def _edit_masses(spec: mujoco.MjSpec, model: mujoco.MjModel, scale: Array, paylo
     bodies = {body.id: body for body in spec.bodies}
     for link, factor in zip(model.jnt_bodyid, scale, strict=True):
         for b in np.flatnonzero(model.body_weldid == link):
+            if b != link and model.body_mass[b] == 0.0:
+                continue  # a tool frame or the like; MuJoCo takes no full inertia of zeros
             flat = np.empty(9)
             mujoco.mju_quat2Mat(flat, model.body_iquat[b])
             R = flat.reshape(3, 3)

@@ -53,7 +53,7 @@ def summarise(scenario: Scenario, logs: Mapping[str, RunLog]) -> dict[str, Any]:
             "seed": logs[name].seed,
             "stopped": _stopped(logs[name]),
         }
-    arms = sorted({settings.arm for settings in scenario.variants.values()})
+    arms = {arm for one in scenario.variants.values() for arm in (one.arm, one.controller.model.arm) if arm is not None}
     return {
         "name": scenario.name,
         "variants": variants,
@@ -65,7 +65,7 @@ def summarise(scenario: Scenario, logs: Mapping[str, RunLog]) -> dict[str, Any]:
         "hashes": {
             "scenario": _hash(scenario.text.encode()),
             "document": _hash(json.dumps(scenario.document, sort_keys=True).encode()),
-            "models": {arm: _hash(model_path(arm, scenario.folder).read_bytes()) for arm in arms},
+            "models": {arm: _hash(model_path(arm, scenario.folder).read_bytes()) for arm in sorted(arms)},
         },
     }
 

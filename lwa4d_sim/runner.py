@@ -67,7 +67,7 @@ def run_batch(
 
     Every member equals the run of the same settings alone, bit for bit. Members may differ in start, plant, motion,
     gains, belief, seed, and in the loop's latency, jitter, loss and resolutions as long as its phase stays the same;
-    not in arm, the rest of the loop, plant step or duration.
+    not in arm, the model file believed, the rest of the loop, plant step or duration.
 
     Args:
         scenario: the scenario.

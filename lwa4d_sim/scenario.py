@@ -14,7 +14,7 @@ from lwa4d_sim.settings import CHOICES, Settings
 from lwa4d_sim.yaml_text import parse
 
 DEFAULT_VARIANT = "default"  # the one variant of a scenario that names none
-_VARIANT_KEYS = ("arm", "initial", "plant", "trajectory", "controller", "compensation", "loop")
+_VARIANT_KEYS = ("arm", "initial", "plant", "trajectory", "controller", "compensation", "loop", "identify")
 _TOP_KEYS = ("name", *_VARIANT_KEYS, "variants", "expect")
 _LARGEST = 10_000_000  # [bytes]; no scenario is that long, but a device file is
 _NAME_BYTES = 200  # file systems take 255, and a temporary name is a little longer than the name

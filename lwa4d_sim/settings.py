@@ -19,6 +19,7 @@ from lwa4d_sim.drives import LateData
 from lwa4d_sim.edits import ArmEdits
 from lwa4d_sim.estimators import FilteredDerivative
 from lwa4d_sim.estimators import VelocityParameters as PlainVelocity
+from lwa4d_sim.identification.options import Identify
 from lwa4d_sim.interfaces import STRICT, NonNegative, Positive
 from lwa4d_sim.observers import ObserverVelocity
 from lwa4d_sim.plant import Disturbance
@@ -201,6 +202,7 @@ class Settings:
         controller: control law, gains and belief.
         compensation: what wins back gain lost to the bus.
         loop: what lies between controller and arm.
+        identify: what the command `identify` makes of a run.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -212,6 +214,7 @@ class Settings:
     controller: ControllerParameters
     compensation: Compensation | None = None
     loop: LoopSettings = field(default_factory=SampledLoop)
+    identify: Identify | None = None
 
 
 #: Blocks that a scenario chooses by `kind`: the classes, and the kind that may be left out.

@@ -12,7 +12,8 @@ import numpy as np
 from annotated_types import MinLen
 
 from lwa4d_sim.errors import KinematicsError, TrajectoryError
-from lwa4d_sim.interfaces import STRICT, Array, Positive
+from lwa4d_sim.fourier import fourier_series, led
+from lwa4d_sim.interfaces import STRICT, Array, NonNegative, Positive
 from lwa4d_sim.motion_files import read_samples
 from lwa4d_sim.motions import POSE_JOINTS, JointMotion, Kinematics, RedundantKinematics, TaskMotion, Turn
 from lwa4d_sim.polynomials import PiecewisePolynomial, boundary_polynomial
@@ -196,14 +197,16 @@ class FourierMotion:
 
     theta_i(t) = offset_i + sum over k = 1..N of a_ik / (k omega) sin(k omega t) - b_ik / (k omega) cos(k omega t)
 
-    It does not start at the arm's start posture, nor at rest. Afterwards it rests where it ended.
+    Without leads it starts neither at the arm's start posture nor at rest, and afterwards rests where it ended.
 
     Attributes:
         a: joint speed amplitudes of the sines' derivatives, one row of N per joint [rad/s].
         b: joint speed amplitudes of the cosines' derivatives, one row of N per joint [rad/s].
         offset: theta_i0, one per joint [rad]; zero when absent.
         omega: base frequency [rad/s]. The thesis's "omega = 1 [Hz]" can be read as 1 rad/s or as 2 pi rad/s.
-        duration: length of the motion [s].
+        duration: length of the series [s]; the motion lasts lead_in + duration + lead_out.
+        lead_in: time of a quintic before it, from rest at the arm's start [s].
+        lead_out: time in which the arm brakes after it [s]; it comes to rest near the series' end.
     """
 
     __pydantic_config__: ClassVar[Any] = STRICT
@@ -213,6 +216,8 @@ class FourierMotion:
     offset: Row | None = None
     omega: Positive = 1.0
     duration: Positive
+    lead_in: NonNegative = 0.0
+    lead_out: NonNegative = 0.0
 
     def build(self, kinematics: Kinematics, q0: Array, base: Path | None = None) -> JointMotion:
         """The running trajectory; arguments as `WaypointMotion.build`.
@@ -224,14 +229,9 @@ class FourierMotion:
         a = _rows("a", self.a, N, "as many as the first row", joints)
         b = _rows("b", self.b, N, "as many as a", joints)
         offset = _rows("offset", [self.offset or np.zeros(joints)], joints, "one angle per joint")
-        k_omega = self.omega * np.arange(1, N + 1)
-
-        def curve(t: Array) -> tuple[Array, Array, Array]:
-            sin, cos = np.sin(t[:, None] * k_omega), np.cos(t[:, None] * k_omega)  # (K, N)
-            q = offset + (sin / k_omega) @ a.T - (cos / k_omega) @ b.T
-            return q, cos @ a.T + sin @ b.T, (cos * k_omega) @ b.T - (sin * k_omega) @ a.T
-
-        return JointMotion(kinematics, np.array([self.duration]), curve)
+        series = fourier_series(a, b, offset[0], self.omega)
+        knots, curve = led(series, np.asarray(q0, dtype=float), self.lead_in, self.duration, self.lead_out)
+        return JointMotion(kinematics, knots, curve)
 
 
 THESIS_EXCITATION = FourierMotion(  # joints 2 and 4 of the planar arm; thesis, section 5.1.3

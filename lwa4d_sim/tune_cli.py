@@ -61,7 +61,7 @@ def tune(
     """
     from lwa4d_sim.scenario import Scenario
     from lwa4d_sim.stability.analysis import default_variant
-    from lwa4d_sim.tuned_file import place_for, tuned_document, verified, write_tuned
+    from lwa4d_sim.tuned_file import tuned_document, tuned_place, verified, write_tuned
     from lwa4d_sim.tuning import Wish, tune
 
     _require("--gain-margin", gain_margin, 1.0, 1000.0)
@@ -77,7 +77,7 @@ def tune(
         peak=peak,
         workspace=over is OverOption.workspace,
     )
-    path = place_for(scenario, out)
+    path = tuned_place(scenario, out)
     with busy(f"tuning {scenario.name}", quiet=as_json):
         found = tune(scenario, name, wish)
         runs = verified(scenario, name, found)

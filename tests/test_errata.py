@@ -231,8 +231,9 @@ def test_10_the_regressor() -> None:
 
 
 def test_what_is_lost_was_decided_once() -> None:
-    """The fourth waypoint closes the rectangle and is the same in every scenario."""
+    """The fourth waypoint closes the rectangle and is the same in every scenario that goes through waypoints."""
     assert WAYPOINTS[3] == [*WAYPOINTS[2][:2], WAYPOINTS[0][2]]
     for file in sorted(shipped_scenarios().glob("*.yaml")):
-        scenario = Scenario.load(file)
-        assert scenario.document["trajectory"]["waypoints"]["points"] == WAYPOINTS, file
+        trajectory = Scenario.load(file).document["trajectory"]
+        if trajectory["kind"] == "waypoints":
+            assert trajectory["waypoints"]["points"] == WAYPOINTS, file

@@ -172,12 +172,12 @@ def test_bad_input_is_one_line_and_writes_nothing(
 
 def test_a_file_that_cannot_be_written_is_named(call: Callable[..., Result], tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    refused(call("tune", "pd_joint_p2.5", "-o", str(tmp_path / "file")), "cannot write the tuned scenario")
+    refused(call("tune", "pd_joint_p2.5", "-o", str(tmp_path / "file")), "cannot write the scenario")
 
 
 def test_a_file_of_ones_own_is_left_alone(call: Callable[..., Result], tmp_path: Path) -> None:
     (path := tmp_path / "pd_joint_p2.5_tuned.yaml").write_text("# my own gains\n")
-    refused(call("tune", "pd_joint_p2.5", "-o", str(tmp_path)), "was not made by a tuning; choose another folder")
+    refused(call("tune", "pd_joint_p2.5", "-o", str(tmp_path)), "was not made by this command; choose another folder")
     assert path.read_text() == "# my own gains\n"
 
 

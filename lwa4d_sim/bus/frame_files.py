@@ -70,7 +70,7 @@ def replay(path: Path, bus: Connection, stopped: Callable[[], bool], *, commands
     """
     sent = left_out = 0
     due, before = time.monotonic(), None
-    for msg in _read(path):
+    for msg in read(path):
         # no gap is negative, and what is no number is none
         due += min(max(0.0, msg.timestamp - before), LONGEST_GAP) if before is not None else 0.0
         before = msg.timestamp
@@ -99,7 +99,7 @@ def _reached(due: float, stopped: Callable[[], bool]) -> bool:
     return False
 
 
-def _read(path: Path) -> Iterator[can.Message]:
+def read(path: Path) -> Iterator[can.Message]:
     """Data and remote frames of a log.
 
     Raises:

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from lwa4d_sim.assembly import Blocks, build_blocks, build_controller
+from lwa4d_sim.controllers.belief import believed_model
 from lwa4d_sim.dynamics import NominalModel
 from lwa4d_sim.errors import ScenarioError
 from lwa4d_sim.interfaces import NS_PER_S, Array, Controller, IntArray
-from lwa4d_sim.mjcf import load_model
 from lwa4d_sim.observers import ObserverVelocity
 from lwa4d_sim.scenario import Scenario
 from lwa4d_sim.settings import CanopenLoop, IdealLoop, SampledLoop
@@ -59,7 +59,7 @@ class Study:
         self.n, self.loop_settings = self.blocks.arm.n, self.settings.loop
         with self.blocks.about("controller"):
             belief = self.settings.controller.model
-            self._believed = load_model(self.settings.arm, belief, base=scenario.folder)
+            self._believed = believed_model(belief, self.settings.arm, scenario.folder)
             self._make_law()
         self._arms: dict[tuple[str, int], NominalModel] = {}
         if isinstance(self.loop_settings, SampledLoop):

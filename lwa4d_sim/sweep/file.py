@@ -223,7 +223,9 @@ class Sweep:
         document = {key: value for key, value in self._document.items() if key not in ("name", "metrics")}
         for part in (document, self.metrics, self.scenario.document, self.variant):
             made.update(json.dumps(part, sort_keys=True).encode())
-        made.update(model_path(settings.arm, self.scenario.folder).read_bytes())
+        for arm in (settings.arm, settings.controller.model.arm):
+            if arm is not None:
+                made.update(model_path(arm, self.scenario.folder).read_bytes())
         if isinstance(settings.trajectory, SampledMotion):
             made.update((self.scenario.folder / settings.trajectory.file).read_bytes())
         return made.hexdigest()

@@ -1,0 +1,247 @@
+"""Identification from recordings: equations, estimate, what it is worth, the possible arm nearest to it, validation."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lwa4d_sim.errors import IdentificationError
+from lwa4d_sim.identification.consistent import consistent
+from lwa4d_sim.identification.equations import Equations, equations
+from lwa4d_sim.identification.estimate import INTERVAL, Estimate, fit, recursive
+from lwa4d_sim.identification.friction import Friction, friction_of
+from lwa4d_sim.identification.noise import Influence, influence
+from lwa4d_sim.identification.options import Identify
+from lwa4d_sim.identification.parameters import KINDS, Unknowns, unknowns_of
+from lwa4d_sim.identification.sets import ParameterSet, base_set, thesis_set
+from lwa4d_sim.interfaces import Array
+from lwa4d_sim.mjcf import torque_limits
+from lwa4d_sim.recordings.recording import Recording
+
+FEWEST_SLIDING = 0.2  # assumed: share of a joint's rows below which those in which it turns or sticks are used as well
+PASSES = 2  # of the fit: the first says how slowly a joint may slide
+# How far a joint's parameter usually is from its nominal value, as a share of the peak torque: assumed from the wrist's
+# friction and rotors, which are 0.01 to 0.25 of it (`lwa4d_sim.arm.WRIST`).
+USUAL = {"viscous": 0.25, "coulomb": 0.1, "offset": 0.02, "armature": 0.01}
+USUAL_GAIN = 0.1  # assumed
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is asked of an arm.
+
+    Attributes:
+        options: of the scenario.
+        model: the nominal arm, compiled.
+        unknowns: of the arm.
+        nominal: their values (P,).
+        fixed: values of those that are not estimated, by name.
+        parameters: that are estimated.
+        friction: law of Coulomb friction.
+    """
+
+    options: Identify
+    model: Any
+    unknowns: Unknowns
+    nominal: Array
+    fixed: Mapping[str, float]
+    parameters: ParameterSet
+    friction: Friction
+
+    @staticmethod
+    def of(options: Identify, model: Any) -> "Problem":
+        """The problem that ``options`` set for a nominal arm.
+
+        Raises:
+            IdentificationError: an unknown is named that the arm does not have, or the parameters are another arm's.
+        """
+        gain = ("gain",) if "gain" in options.joints else ()
+        kinds = tuple(kind for kind in KINDS if kind != "gain" or gain)
+        unknowns = unknowns_of(model, kinds)
+        nominal = unknowns.values(model)
+        for name in options.known:
+            if name not in unknowns.names:
+                raise IdentificationError(
+                    f"no unknown of that name; there are {', '.join(unknowns.names)}", f"identify.known.{name}"
+                )
+        taken = {
+            unknowns.names[k]: float(nominal[k])
+            for kind in kinds
+            if kind not in options.joints
+            for k in unknowns.columns(kind)
+        }
+        fixed = {**taken, **options.known}
+        names = tuple(fixed)
+        if options.parameters == "thesis":
+            parameters = thesis_set(unknowns, names, nominal)
+        else:
+            parameters = base_set(unknowns, names)
+        return Problem(options, model, unknowns, nominal, fixed, parameters, friction_of(model))
+
+    def equations(self, recording: Recording, coulomb: Array) -> Equations:
+        """Of a recording, given about the size of Coulomb friction (n,) [N m]."""
+        splits = self.parameters.splits
+        return equations(recording, self.unknowns, self.options.bandwidth, self.friction, coulomb, gravity=splits)
+
+    def columns(self, made: Equations) -> Array:
+        """The parameters' regressor (W, n, r)."""
+        return self.parameters.columns(made.Y, made.gravity)
+
+    def torque(self, made: Equations) -> Array:
+        """What is left of the torque (W, n) when the fixed unknowns have had their part."""
+        values = np.array([self.fixed.get(name, 0.0) for name in self.unknowns.names])
+        return np.asarray(made.b - made.Y @ values)
+
+    def coulomb(self, unknowns: Array) -> Array:
+        """Size of Coulomb friction (n,) [N m] among values of the unknowns (P,)."""
+        return np.maximum(unknowns[self.unknowns.columns("coulomb")], 0.0)
+
+    def all_unknowns(self, x: Array) -> Array:
+        """Some values of the unknowns (P,) with parameters ``x`` (r,)."""
+        values = self.parameters.unknowns(x)
+        for name, value in self.fixed.items():
+            values[self.unknowns.names.index(name)] = value
+        return values
+
+    def value(self, unknowns: Array) -> Array:
+        """The parameters (r,) of values of the unknowns (P,)."""
+        return np.asarray(self.parameters.combine @ self._free(unknowns))
+
+    def _free(self, unknowns: Array) -> Array:
+        fixed = [name in self.fixed for name in self.unknowns.names]
+        return np.where(fixed, 0.0, unknowns)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One recording fitted.
+
+    Attributes:
+        equations: of the recording.
+        used: rows (W, n) that were fitted.
+        estimate: of the parameters.
+        std_error: (r,).
+        torque_noise: standard deviation of each torque sample (n,) [N m], as the residuals have it.
+        influence: of the samples' noise on the estimate.
+        covariance: of the estimate (r, r).
+    """
+
+    equations: Equations
+    used: NDArray[np.bool_]
+    estimate: Estimate
+    torque_noise: Array
+    influence: Influence
+    covariance: Array
+
+    @property
+    def std_error(self) -> Array:
+        """Standard errors (r,), NaN where the data do not tell."""
+        return np.where(self.estimate.lost, np.nan, np.sqrt(np.diag(self.covariance)))
+
+
+def fit_recording(problem: Problem, recording: Recording, like: "Fit | None" = None) -> Fit:
+    """Estimate the parameters from a recording.
+
+    Args:
+        problem: what is asked.
+        recording: the data.
+        like: a fit of the same motion, from which the influence of noise and the size of friction are taken.
+
+    Raises:
+        IdentificationError: the recording is too short or tells nothing at all.
+    """
+    coulomb = problem.coulomb(problem.nominal if like is None else problem.all_unknowns(like.estimate.nearest))
+    prior = problem.value(problem.nominal)
+    for _ in range(PASSES if like is None else 1):
+        made = problem.equations(recording, coulomb)
+        used = _used(problem, made)
+        Y, b = problem.columns(made) * used[..., None], problem.torque(made) * used
+        noise = None if problem.options.method != "total" else regressor_noise(problem, recording, made, used, coulomb)
+        estimate = fit(Y, b, prior, problem.options.method, noise)
+        coulomb = problem.coulomb(problem.all_unknowns(estimate.nearest))
+    if estimate.lost.all():
+        raise IdentificationError(f"{recording.source}: the joints do not move enough to tell any parameter")
+    x = problem.all_unknowns(estimate.nearest)
+    spread = influence(made, used, x, estimate.gain) if like is None else like.influence
+    torque_noise = spread.torque_noise(estimate.residual, made.noise, int((~estimate.lost).sum()))
+    torque_noise = np.maximum(torque_noise, recording.torque_step / np.sqrt(12.0))
+    return Fit(made, used, estimate, torque_noise, spread, spread.covariance(made.noise, torque_noise))
+
+
+def _used(problem: Problem, made: Equations) -> NDArray[np.bool_]:
+    """Rows to be fitted: where Coulomb friction is a constant, unless that leaves next to nothing."""
+    names = problem.unknowns.names
+    with_friction = np.array(
+        [names[k] not in problem.fixed or problem.fixed[names[k]] > 0 for k in problem.unknowns.columns("coulomb")]
+    )
+    used = made.sliding | ~with_friction
+    return np.asarray(used | (used.mean(axis=0) < FEWEST_SLIDING))
+
+
+def regressor_noise(
+    problem: Problem, recording: Recording, made: Equations, used: NDArray[np.bool_], coulomb: Array, draws: int = 8
+) -> Array:
+    """Mean of E^T E (r + 1, r + 1) of the errors E that noise of the samples makes in the weighted [Y b]."""
+    rng = np.random.default_rng(0)
+    prior = problem.value(problem.nominal)
+    first = fit(problem.columns(made) * used[..., None], problem.torque(made) * used, prior)
+    root = np.sqrt(first.weights)[:, None]
+    total = np.zeros((len(problem.parameters.names) + 1,) * 2)
+    step = np.maximum(made.noise, 1e-12)
+    for _ in range(draws):
+        moved = replace(recording, q=recording.q + step * rng.normal(size=recording.q.shape))
+        there = problem.equations(moved, coulomb)
+        E = np.concatenate([problem.columns(there) - problem.columns(made), (there.b - made.b)[..., None]], axis=-1)
+        E = (E * root * used[..., None]).reshape(-1, len(total))
+        total += E.T @ E / draws
+    return total
+
+
+def possible(problem: Problem, found: Fit) -> Array:
+    """Unknowns (P,) of the physically possible arm that fits best; what the data do not tell is nominal."""
+    u = problem.unknowns
+    Y, b = found.equations.Y, problem.torque(found.equations)
+    root = (np.sqrt(found.estimate.weights) * found.used)[..., None]
+    free = np.array([name not in problem.fixed for name in u.names])
+    prior = problem.nominal.copy()
+    for name, value in problem.fixed.items():
+        prior[u.names.index(name)] = value
+    rows = np.concatenate([Y * root * free, b[..., None] * root], axis=-1).reshape(-1, len(free) + 1)
+    R = np.asarray(np.linalg.qr(rows, mode="r"))
+    peak = torque_limits(problem.model)
+    peak = np.where(np.isfinite(peak), peak, np.nanmax(np.where(np.isfinite(peak), peak, np.nan), initial=100.0))
+    usual = np.concatenate([peak * USUAL[kind] if kind in USUAL else np.full(u.n, USUAL_GAIN) for kind in u.kinds])
+    signed = np.concatenate([np.full(u.n, kind in ("offset", "gain")) for kind in u.kinds])
+    joint = slice(10 * u.n, None)
+    lower = np.where(free[joint], np.where(signed, -np.inf, 0.0), prior[joint])
+    upper = np.where(free[joint], np.inf, prior[joint])
+    return consistent(R[:, :-1], R[:, -1], prior, n_links=u.n, spread=np.maximum(usual, 1e-6), lower=lower, upper=upper)
+
+
+def nrmse(problem: Problem, made: Equations, torque: Array) -> Array:
+    """Root mean square of the torque that ``torque`` (W, n) does not predict, over the torque's own deviation, (n,)."""
+    scale = made.b.std(axis=0)
+    scale = np.where(scale > 0, scale, np.inf)
+    return np.asarray(np.sqrt(((made.b - torque) ** 2).mean(axis=0)) / scale)
+
+
+def predicted(problem: Problem, made: Equations, x: Array) -> Array:
+    """Torque (W, n) of parameters ``x`` (r,) and the fixed unknowns."""
+    return np.asarray(problem.columns(made) @ x + made.b - problem.torque(made))
+
+
+def convergence(problem: Problem, found: Fit) -> tuple[Array, Array]:
+    """Instants (W,) [s] and the recursive estimate (W, r) at each, as in the thesis's Figure 5.2c."""
+    estimate, prior = found.estimate, problem.value(problem.nominal)
+    Y = problem.columns(found.equations) * found.used[..., None]
+    b = problem.torque(found.equations) * found.used - Y @ prior
+    values = prior + np.array(list(recursive(Y, b, estimate.weights)))
+    values[:, estimate.lost] = np.nan
+    return found.equations.t, values
+
+
+def covers(estimate: Array, std_error: Array, truth: Array) -> NDArray[np.bool_]:
+    """Whether the 95 % intervals hold the truth."""
+    return np.asarray(np.abs(estimate - truth) <= INTERVAL * std_error)
