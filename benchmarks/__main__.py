@@ -22,7 +22,7 @@ import numpy as np
 from mujoco import rollout
 from mujoco.batch import Batch
 
-from benchmarks import scale
+from benchmarks import identification, scale
 from lwa4d_sim.batch import default_workers
 from lwa4d_sim.bus.live_run import report
 from lwa4d_sim.bus.wire import Wire
@@ -211,6 +211,9 @@ BENCHMARKS: dict[str, tuple[Callable[[], tuple[float, float]], str, float]] = {
     "workers": (scale.workers, "a sweep on two Dask workers / on one", 0.59),
     "pose": (scale.pose, "stability of one pose, milliseconds", 1.0),
     "map": (scale.workspace_map, "critical gains of 50 x 50 poses of 7 joints, seconds", 10.0),
+    "regressor": (identification.regressor, "100,000 7-joint regressors / Pinocchio from Python", 3.0),
+    "minute": (identification.minute, "7 joints identified from 60 s at 1 kHz, seconds", 30.0),
+    "design": (identification.design, "a motion of 7 joints and 5 harmonics found, seconds", 180.0),
     "live": (live, "cycles missed in 60 s of bus serve and bus drive", 0.0),
 }
 

@@ -1,10 +1,12 @@
 """Benchmarks of identification: the regressor against Pinocchio's, a whole identification, the design of a motion."""
 
+import tempfile
 import time
 from dataclasses import replace
 
 import numpy as np
 
+from benchmarks import scale
 from lwa4d_sim.console import shipped_scenarios
 from lwa4d_sim.errors import LwaError
 from lwa4d_sim.identification.experiment import Experiment, noisy
@@ -52,7 +54,7 @@ def regressor() -> tuple[float, float]:
 
 
 def minute() -> tuple[float, float]:
-    """Identification of the seven-joint arm from a minute at 1 kHz, over 30 s; the data are simulated before."""
+    """Time [s] of identifying the seven-joint arm from a minute at 1 kHz; the data are simulated before."""
     scenario = Scenario.load(
         shipped_scenarios() / "identify_7dof.yaml",
         {"trajectory.duration": SECONDS - 7.0, "variants.ideal.identify.bandwidth": 5.0},
@@ -65,4 +67,11 @@ def minute() -> tuple[float, float]:
     convergence(experiment.problem, found)
     bias(experiment.problem, recording, found)
     taken = time.perf_counter() - begin
-    return taken / 30.0, taken
+    return taken, taken
+
+
+def design() -> tuple[float, float]:
+    """Time [s] of the command `excite` for the seven-joint arm with its usual five harmonics."""
+    with tempfile.TemporaryDirectory() as folder:
+        taken = scale.timed(*scale.PROGRAM, "excite", "identify_7dof", "-o", folder, cwd=folder)
+    return taken, taken

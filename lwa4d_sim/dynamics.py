@@ -14,6 +14,7 @@ from mujoco.batch import Batch
 from lwa4d_sim.chain import bias_from_jacobian, jacobian_from_axes
 from lwa4d_sim.errors import ModelError
 from lwa4d_sim.interfaces import Array, Pose
+from lwa4d_sim.joint_friction import JointFriction
 
 _VELOCITY_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
@@ -33,6 +34,7 @@ class NominalModel:
         if not isinstance(models, mujoco.MjModel):
             self._batch.set_models(models)
         n = first.nv
+        self._friction = JointFriction([models] if isinstance(models, mujoco.MjModel) else models)
         self._slide = np.asarray(first.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE)
         self._site = tool_site(first)
         self._q, self._dq = self._batch.bind("qpos"), self._batch.bind("qvel")
@@ -50,6 +52,10 @@ class NominalModel:
         self._batch.forward(stage=_VELOCITY_STAGE)
         self._jacobian: Array | None = None
         return self
+
+    def friction(self, dq: Array) -> Array:
+        """Friction torque (N, n) [N m] at joint speed ``dq`` (N, n); see `JointFriction`."""
+        return self._friction(dq)
 
     def _field(self, name: str) -> Array:
         """A bound MjData field; the first use binds it and evaluates once more to fill it."""
@@ -201,7 +207,12 @@ class ClosedForm3:
         self._vertical = inertia[:, 2, 2]  # Iyy of the thesis
         self._pitch = inertia[:, 1, 1]  # Izz of the thesis
         self._armature = np.asarray(model.dof_armature)
+        self._friction = JointFriction([model])
         self._check(model)
+
+    def friction(self, dq: Array) -> Array:
+        """Friction torque (N, 3) [N m] at joint speed ``dq`` (N, 3); see `JointFriction`."""
+        return self._friction(dq)
 
     def _check(self, model: mujoco.MjModel) -> None:
         """Compare with MuJoCo at a few states without any symmetry."""

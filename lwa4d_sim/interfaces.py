@@ -166,6 +166,10 @@ class ArmModel(Protocol):
         """Terms at ``q`` and ``dq`` (N, n); without ``dq`` at rest. Valid until the next call."""
         ...
 
+    def friction(self, dq: Array) -> Array:
+        """Friction torque (N, n) [N m] at joint speed ``dq`` (N, n), with the sign of the speed."""
+        ...
+
 
 class Controller(Protocol):
     """A control law. ``ref`` is a JointReference or a TaskReference, as the controller's ``space`` says."""

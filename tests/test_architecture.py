@@ -19,7 +19,7 @@ ROWS = (
     # words
     "errors interfaces",
     # the arm on paper
-    "rotations polynomials newton dh",
+    "rotations polynomials newton dh joint_friction",
     "chain",
     "inverse dynamics",
     "kinematics arm mjcf_checks edits",

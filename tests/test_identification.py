@@ -305,7 +305,7 @@ def test_recursive_least_squares_ends_where_the_batch_does(seed: int) -> None:
     rng = np.random.default_rng(seed)
     Y, x = rng.normal(size=(80, 2, 4)), rng.normal(size=4)
     b = Y @ x + 0.1 * rng.normal(size=(80, 2))
-    batch = fit(Y, b, np.zeros(4))
+    batch = fit(Y, b, np.zeros(4), np.ones(4))
     *_, last = recursive(Y, b, batch.weights)
     np.testing.assert_allclose(last, batch.x, rtol=1e-5, atol=1e-7)
     normal = sum(y.T @ np.diag(batch.weights) @ y for y in Y)
@@ -318,13 +318,13 @@ def test_what_data_do_not_tell_has_no_number() -> None:
     rng = np.random.default_rng(0)
     Y = rng.normal(size=(100, 2, 3))
     Y[..., 2] = 2.0 * Y[..., 1]
-    found = fit(Y, Y @ np.ones(3), np.array([0.0, 0.0, 5.0]))
+    found = fit(Y, Y @ np.ones(3), np.array([0.0, 0.0, 5.0]), np.ones(3))
     assert found.lost.tolist() == [False, True, True]
     assert np.isnan(found.x[1:]).all()
     assert np.isfinite(found.x[0])
     np.testing.assert_allclose(Y @ found.nearest, Y @ np.ones(3), atol=1e-9)  # the sum of the two is told all the same
     with pytest.raises(IdentificationError, match="too few"):
-        fit(Y[:2], np.ones((2, 2)), np.zeros(3))
+        fit(Y[:2], np.ones((2, 2)), np.zeros(3), np.ones(3))
 
 
 def test_total_least_squares_has_no_bias_where_the_ordinary_has() -> None:
@@ -333,10 +333,10 @@ def test_total_least_squares_has_no_bias_where_the_ordinary_has() -> None:
     true, noise = rng.normal(size=(20000, 1, 2)), 0.3 * rng.normal(size=(20000, 1, 2))
     noise[..., 1] = 0.0
     Y, b = true + noise, true @ np.array([2.0, -1.0]) + 0.01 * rng.normal(size=(20000, 1))
-    plain = fit(Y, b, np.zeros(2))
+    plain = fit(Y, b, np.zeros(2), np.ones(2))
     assert plain.x[0] == pytest.approx(2.0 / 1.09, rel=0.01)
     spread = np.diag([0.09, 0.0, 1e-4]) * 20000 * plain.weights[0]
-    np.testing.assert_allclose(fit(Y, b, np.zeros(2), "total", spread).x, [2.0, -1.0], rtol=0.01)
+    np.testing.assert_allclose(fit(Y, b, np.zeros(2), np.ones(2), "total", spread).x, [2.0, -1.0], rtol=0.01)
 
 
 def test_unknown_names_are_refused_with_those_that_exist() -> None:

@@ -7,17 +7,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lwa4d_sim.edits import ArmEdits
 from lwa4d_sim.errors import IdentificationError
-from lwa4d_sim.identification.adjustable import REACH
+from lwa4d_sim.identification.adjustable import REACH, What
+from lwa4d_sim.identification.inertia import standard_parameters
 from lwa4d_sim.identification.refine import Refined, refine
-from lwa4d_sim.identification.shooting import Pieces, Starts, cut
+from lwa4d_sim.identification.shooting import Pieces, cut
+from lwa4d_sim.identification.slack import Inertia, Slack
 from lwa4d_sim.interfaces import Array
-from lwa4d_sim.mjcf import model_path
+from lwa4d_sim.mjcf import load_model, model_path
 from lwa4d_sim.recordings.recording import Recording
 from lwa4d_sim.recordings.run_data import from_run
 from lwa4d_sim.runner import run
@@ -32,6 +36,7 @@ COUNT = 1.7453e-5  # [rad]; a millidegree, as the drives of the LWA4D count
 # Joints with rotors and friction like the wrist's, where a PD over the bus is stable. None is in the shipped models.
 JOINTS = {"joint2": (1.0, (8.0, 0.0, 0.0), 2.0), "joint4": (0.5, (5.0, 0.0, 0.0), 1.0)}
 SEGMENT = 0.25  # [s]; shorter than usual, as the runs are
+SHAPE: tuple[What, ...] = ("delay", "friction")
 SCENARIO = """
 name: excited
 arm: {arm}
@@ -85,7 +90,7 @@ def plain(nominal: Path) -> Recording:
 def errors(found: Refined, truth: dict[str, float]) -> Array:
     """How many standard errors each estimate is off; what is not named is as before."""
     true = [truth.get(name, start) for name, start in zip(found.names, found.start, strict=True)]
-    return np.abs(found.estimate - true) / found.std_error
+    return np.asarray(np.abs(found.estimate - true) / found.std_error)
 
 
 # -- what is there is found --------------------------------------------------------------------------------------------
@@ -94,7 +99,7 @@ def errors(found: Refined, truth: dict[str, float]) -> Array:
 def test_delay_and_quadratic_friction_are_found_together(folder: Path, nominal: Path) -> None:
     plant = arm(folder, joint2=(1.0, (8.0, 3.0, 0.0), 2.0), joint4=(0.5, (5.0, 2.0, 0.0), 1.0))
     steps: list[None] = []
-    found = refine(nominal, recorded(plant, 0.003), segment=SEGMENT, advance=lambda: steps.append(None))
+    found = refine(nominal, recorded(plant, 0.003), what=SHAPE, segment=SEGMENT, advance=lambda: steps.append(None))
     value = dict(zip(found.names, found.estimate, strict=True))
     truth = {"delay": 0.003, "joint2.quadratic": 3.0, "joint4.quadratic": 2.0}
     assert errors(found, truth).max() < 3.0
@@ -108,7 +113,7 @@ def test_delay_and_quadratic_friction_are_found_together(folder: Path, nominal: 
 
 
 def test_where_there_is_nothing_to_find_zero_is_found(nominal: Path, plain: Recording) -> None:
-    found = refine(nominal, plain, segment=SEGMENT)
+    found = refine(nominal, plain, what=SHAPE, segment=SEGMENT)
     assert errors(found, {}).max() < 3.0
     assert found.after == pytest.approx(found.before, rel=0.05)
     assert dict(zip(found.names, found.std_error, strict=True))["delay"] < 1e-5
@@ -126,6 +131,19 @@ def test_each_joint_has_its_delay_offset_and_mass(nominal: Path) -> None:
     values = dict(zip(found.names, found.estimate, strict=True))
     assert abs(values["joint4.delay"] - 0.004) < 2e-4
     assert values["link4.scale"] == pytest.approx(1.1, rel=1e-3)
+
+
+def test_a_delay_is_found_behind_wrong_inertia(nominal: Path) -> None:
+    """Two roads to one model: its masses known, and its inertia fitted along."""
+    recording = recorded(nominal, 0.003, mass_scale=(0.97, 1.02))
+    biased = replace(recording, tau=recording.tau + np.array([0.1, -0.1]))
+    fixed = refine(nominal, biased, what=("delay", "offset"), segment=SEGMENT)
+    assert abs(fixed.estimate[0] - 0.003) > 2e-4, "what is taken as exact has to be"
+    along = refine(nominal, biased, what=("delay", "offset", "inertia"), segment=SEGMENT)
+    assert errors(along, {"delay": 0.003, "joint2.offset": 0.1, "joint4.offset": -0.1}).max() < 3.0
+    assert abs(along.estimate[0] - 0.003) < 2e-5
+    # of 450 samples 43 go into starts and inertia, which leaves 0.95 of the encoder's rounding; and chance
+    assert along.after == pytest.approx(0.95 * COUNT / np.sqrt(12), rel=0.1)
 
 
 def test_lost_samples_and_unknown_torques_cost_pieces_and_nothing_else(nominal: Path) -> None:
@@ -205,19 +223,43 @@ def test_positions_between_steps_are_a_cubic() -> None:
 
 
 @given(st.integers(0, 2**31), st.booleans())
-def test_what_other_starts_explain_is_left_out(seed: int, dark: bool) -> None:
+def test_what_nobody_asks_for_is_left_out(seed: int, dark: bool) -> None:
     rng = np.random.default_rng(seed)
-    change = rng.normal(size=(3, 20, 2, 4))
+    change, shared = rng.normal(size=(3, 20, 2, 4)), rng.normal(size=(3, 20, 2, 2))
     change[..., 2] *= not dark  # a start without effect
-    starts = Starts.of(change, np.array([1.0, 1e-3]))
-    shift, noise = rng.normal(size=(3, 4)), rng.normal(size=(3, 20, 2))
-    shift[:, 2] *= not dark
-    explained = np.einsum("smnk,sk->smn", change, shift)
-    assert starts.rank == (9 if dark else 12)
-    assert np.abs(starts.left(explained)).max() < 1e-9
-    np.testing.assert_allclose(starts.left(explained + noise), starts.left(noise), atol=1e-9)
-    np.testing.assert_allclose(starts.left(starts.left(noise)), starts.left(noise), atol=1e-9)
-    np.testing.assert_allclose(starts.shift(explained), shift, atol=1e-9)
+    slack = Slack.of(change, shared, np.array([1.0, 1e-3]))
+    starts, parameters, noise = rng.normal(size=(3, 4)), rng.normal(size=2), rng.normal(size=(3, 20, 2))
+    starts[:, 2] *= not dark
+    explained = np.einsum("smnk,sk->smn", change, starts) + shared @ parameters
+    assert slack.rank == (11 if dark else 14)
+    assert np.abs(slack.left(explained)).max() < 1e-9
+    np.testing.assert_allclose(slack.left(explained + noise), slack.left(noise), atol=1e-9)
+    np.testing.assert_allclose(slack.left(slack.left(noise)), slack.left(noise), atol=1e-9)
+    for found, true in zip(slack.explained(explained), (starts, parameters), strict=True):
+        np.testing.assert_allclose(found, true, atol=1e-9)
+
+
+def test_other_inertia_is_as_other_torque(nominal: Path) -> None:
+    """Against MuJoCo's inverse dynamics of an arm with other masses and rotors."""
+    model, other = load_model(str(nominal)), load_model(str(nominal), ArmEdits(mass_scale=(0.9, 1.2), armature=0.7))
+    q, dq, ddq = np.random.default_rng(2).normal(size=(3, 4, 2))
+    step = 1e-6
+    ends = [np.concatenate([q + s * step / 2 * dq, dq + s * step / 2 * ddq], axis=-1) for s in (-1, 1)]
+    inertia = Inertia.along(model, np.stack(ends, axis=1), step)
+    change = np.concatenate([standard_parameters(other) - standard_parameters(model)], axis=None)
+    change = np.append(change, other.dof_armature - model.dof_armature)
+    torque = [[_inverse(m, *state) for state in zip(q, dq, ddq, strict=True)] for m in (model, other)]
+    np.testing.assert_allclose((inertia.Y @ change)[:, 0], np.subtract(torque[1], torque[0]), atol=1e-7)
+    np.testing.assert_allclose(inertia.Y @ inertia.back, inertia.base, atol=1e-9)
+    flat = inertia.base.reshape(8, -1)
+    np.testing.assert_allclose(flat.T @ flat, 4 * np.eye(flat.shape[1]), atol=1e-9)
+
+
+def _inverse(model: Any, q: Array, dq: Array, ddq: Array) -> Array:
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.qacc[:] = q, dq, ddq
+    mujoco.mj_inverse(model, data)
+    return np.array(data.qfrc_inverse)
 
 
 # -- bad input ---------------------------------------------------------------------------------------------------------
@@ -243,6 +285,7 @@ def bad() -> Iterator[tuple[str, dict[str, Any], dict[str, Any]]]:
     yield "0 pieces", {"tau": np.nan}, {}
     yield "give delay or delays", {}, {"what": ("delay", "delays")}
     yield "give delay or delays", {}, {"what": ()}
+    yield "mass or inertia, not both", {}, {"what": ("mass", "inertia")}
 
 
 @pytest.mark.parametrize(("said", "recording", "call"), [pytest.param(*row, id=row[0][:20]) for row in bad()])
@@ -264,8 +307,9 @@ def test_nothing_is_printed_and_logging_stays_as_it_was(
     with pytest.raises(IdentificationError, match="the model runs away from this motion"):
         refine(away, plain, segment=SEGMENT)
     bare = arm(folder, joint4=(0.5, (5.0, 0.0, 0.0), 0.0))
-    short = replace(plain, **{name: getattr(plain, name)[:80] for name in ("t", "q", "since", "tau")}, end=0.8)
-    refine(bare, short, segment=0.1)
+    t, q, since, tau = (signal[:80] for signal in (plain.t, plain.q, plain.since, plain.tau))
+    short = replace(plain, t=t, q=q, since=since, tau=tau, end=0.8)
+    refine(bare, short, what=SHAPE, segment=0.1)
     assert capfd.readouterr() == ("", "")
     assert logging.root.handlers == []
     assert not logging.getLogger("absl").disabled

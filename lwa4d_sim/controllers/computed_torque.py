@@ -27,7 +27,8 @@ class ComputedTorque:
 
     joint: tau = M (ddq_ref + Kd (dq_ref - dq) + Kp (q_ref - q)) + h;
     task: tau = M J^-1 (ddx_ref + Kd (dx_ref - J dq) + Kp (x_ref - x) - dJ dq) + h, with the dynamically consistent
-    inverse and a null-space posture term for a redundant arm. With p both error poles lie at -p.
+    inverse and a null-space posture term for a redundant arm. With p both error poles lie at -p. With ``friction`` the
+    friction that the model has at the desired speed is added; it follows the reference, so no loop sees it.
 
     Attributes:
         space: where the error is taken.
@@ -35,6 +36,7 @@ class ComputedTorque:
         kp: stiffness [1/s^2], one number or one per joint (task axis).
         kd: damping [1/s], likewise.
         posture: null-space term of a redundant arm in task space [1/s^2, 1/s].
+        friction: feed the model's friction forward; joint space only.
         model: what the controller believes about the arm.
     """
 
@@ -45,14 +47,17 @@ class ComputedTorque:
     kp: Gain | None = None
     kd: Gain | None = None
     posture: Posture = Posture()
+    friction: bool = False
     model: Belief = Belief()
 
     def __post_init__(self) -> None:
-        """Check that the gains are given exactly one way.
+        """Check that the gains are given exactly one way, and that friction is fed forward in joint space.
 
         Raises:
-            ValueError: both p and kp/kd, or neither, or only one of kp and kd.
+            ValueError: both p and kp/kd, or neither, or only one of kp and kd; or friction in task space.
         """
+        if self.friction and self.space == "task":
+            raise ValueError("friction is fed forward in joint space only: a task reference has no joint speeds")
         if (self.p is None) == (self.kp is None and self.kd is None) or (self.kp is None) != (self.kd is None):
             raise ValueError("give either p, or both kp and kd")
 
@@ -75,11 +80,13 @@ class _JointComputedTorque:
     def __init__(self, rows: Sequence[ComputedTorque], n: int) -> None:
         self._kp = gain_rows([row.gains[0] for row in rows], n, "kp")
         self._kd = gain_rows([row.gains[1] for row in rows], n, "kd")
+        self._with_friction = np.array([[float(row.friction)] for row in rows])
 
     def torque(self, state: JointState, ref: JointReference, model: ArmModel) -> Array:
         terms = model.at(state.q, state.dq)
         a = ref.ddq + self._kd * (ref.dq - state.dq) + self._kp * (ref.q - state.q)
-        return apply(terms.M, a) + terms.h
+        tau = apply(terms.M, a) + terms.h
+        return tau + self._with_friction * model.friction(ref.dq) if self._with_friction.any() else tau
 
 
 class _TaskComputedTorque:

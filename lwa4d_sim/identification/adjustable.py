@@ -31,8 +31,8 @@ def adjustable(sysid: Any, spec: Any, what: Sequence[What]) -> tuple[Any, tuple[
     Raises:
         IdentificationError: nothing is asked for, or one thing twice.
     """
-    if not what or ("delay" in what and "delays" in what):
-        raise IdentificationError("what to refine: give delay or delays, friction, offset, mass, or some of them")
+    if not set(what) - {"inertia"} or {"delay", "delays"} <= set(what) or {"mass", "inertia"} <= set(what):
+        raise IdentificationError("what to refine: give delay or delays, friction, offset, mass or inertia, not both")
     params, units = sysid.ParameterDict(), []
     for name, unit, start, bounds, write in _unknowns(spec.compile(), spec, what):
         params.add(sysid.Parameter(name, start, *bounds, modifier=write and _modifier(write)))

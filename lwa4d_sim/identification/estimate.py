@@ -38,13 +38,16 @@ class Estimate:
     condition: float
 
 
-def fit(Y: Array, b: Array, prior: Array, method: Method = "weighted", noise: Array | None = None) -> Estimate:
+def fit(
+    Y: Array, b: Array, prior: Array, usual: Array, method: Method = "weighted", noise: Array | None = None
+) -> Estimate:
     """Fit Y x = b.
 
     Args:
         Y: regressor (W, n, r).
         b: torque (W, n) [N m].
         prior: parameters (r,) to stay with where the data do not tell.
+        usual: rms of columns (r,) that are well excited; of one beside which that is rounding the data tell nothing.
         method: ordinary (thesis, eq. 4.29); weighted by each joint's residual variance; or total, weighted as well,
             which knows that the regressor is noisy too.
         noise: what ``total`` needs: the mean of E^T E of the errors E of [Y b] (W n, r + 1), weighted like them.
@@ -56,6 +59,7 @@ def fit(Y: Array, b: Array, prior: Array, method: Method = "weighted", noise: Ar
     if W * n < 2 * r:
         raise IdentificationError(f"{W * n} equations are too few for {r} parameters; at least {2 * r} are needed")
     rest = b - Y @ prior
+    Y = np.where(np.sqrt((Y**2).mean(axis=(0, 1))) > RANK * usual, Y, 0.0)
     weights: Array = np.ones(n)
     gain, lost, condition = _inverse(Y, weights)
     if method != "ordinary":
@@ -65,7 +69,7 @@ def fit(Y: Array, b: Array, prior: Array, method: Method = "weighted", noise: Ar
     if method == "total":
         told = ~lost
         x[told] = _total(Y[..., told], b - Y[..., lost] @ x[lost], weights, noise, told)
-    return Estimate(np.where(lost, np.nan, x), x, gain, b - Y @ x, weights, lost, condition)
+    return Estimate(np.where(lost, np.nan, x), x, gain, rest - Y @ (x - prior), weights, lost, condition)
 
 
 def _inverse(Y: Array, weights: Array) -> tuple[Array, NDArray[np.bool_], float]:

@@ -3,8 +3,8 @@
 The model runs freely under the recorded torques, piece by piece, and its parameters are turned until it stays with the
 recorded positions. Where each piece starts is not known exactly, and to first order it is fitted too.
 
-A regression that did not know of a delay has hidden most of it in the inertia: shaken at one frequency, a late torque
-looks like a little more of it. Inertia is therefore fitted along, to first order and without saying so.
+A regression that does not know of a delay hides most of it in the inertia, of which it finds a little too much or too
+little. So inertia can go along as well: then the whole delay is found, and not what the regression left of it.
 """
 
 import io
@@ -20,14 +20,14 @@ import numpy as np
 from lwa4d_sim.errors import IdentificationError
 from lwa4d_sim.identification.adjustable import REACH, What, adjustable
 from lwa4d_sim.identification.shooting import cut
-from lwa4d_sim.identification.slack import Slack, inertia_torques
+from lwa4d_sim.identification.slack import Inertia, Slack
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.mjcf import load_model
 from lwa4d_sim.mjcf_checks import name_of
 from lwa4d_sim.recordings.recording import Recording
 
 MOST = 24  # pieces; those of a longer recording are thinned out: seven joints then take about a minute (measured)
-_ROUNDS, _ITERATIONS = 4, 15  # of starts and weights; of the parameters in each (assumed; two and five are usual)
+_ROUNDS, _ITERATIONS = 6, 15  # of what goes along, and of the parameters in each (assumed; three and two are usual)
 _STEP = 1e-6  # of finite differences, in SI units: half-way between rounding and curvature (derived: sqrt of 1e-12)
 _TORQUE = 1e-3  # [N m], of differences with torque (assumed: likewise)
 _SETTLED = 0.2  # standard errors by which a parameter may still move (assumed)
@@ -70,7 +70,7 @@ def refine(
     model_path: Path,
     recording: Recording,
     *,
-    what: Sequence[What] = ("delay", "friction"),
+    what: Sequence[What] = ("delay", "friction", "offset", "inertia"),
     segment: float = 0.5,
     threads: int = 1,
     advance: Callable[[], None] = lambda: None,
@@ -82,10 +82,11 @@ def refine(
         recording: of the motion.
         what: delay = of all torques, beyond what the recording says; delays = one for each joint; friction = viscous
             + quadratic |dq| + cubic dq^2, times dq, and coulomb; offset = torque where none is recorded, with the sign
-            of friction; mass = a factor on mass and inertia of each link, as a check.
+            of friction; mass = a factor on mass and inertia of each link, as a check; inertia = that of links and
+            rotors, to first order, which is fitted along and not told. What is not named is taken as exact.
         segment: length of a piece [s].
         threads: that run the model.
-        advance: called after each iteration; there are at most 60, usually a dozen.
+        advance: called after each iteration; there are at most 96, usually a dozen.
 
     Raises:
         IdentificationError: mujoco.sysid is not installed; the recording is too short, or of another arm; the model
@@ -143,6 +144,8 @@ class _Fit:
         self._pieces = cut(recording, segment, float(model.opt.timestep), REACH, MOST)
         self._state = self._pieces.state
         self._model, self._free = model, "inertia" in what
+        self._inertia: Inertia | None = None
+        self._less = np.zeros(11 * recording.n)
         self._extra = np.zeros((len(self._state), self._pieces.steps, recording.n))
         self._least = np.maximum(recording.position_step / np.sqrt(12.0), _STILL)
         self._rollout = Rollout(nthread=threads if threads > 1 else 0)
@@ -166,7 +169,8 @@ class _Fit:
                 break
             starts, inertia = self._slack.explained(error)
             self._state = self._state + starts
-            self._extra = self._extra + self._others @ inertia
+            if self._inertia is not None:
+                self._less = self._less + self._inertia.back @ inertia
             self._slack = self._linearise(x, after)
         return Refined(
             names=tuple(self._params.keys()),
@@ -224,14 +228,16 @@ class _Fit:
 
     def _linearise(self, x: Array, sigma: Array) -> Slack:
         """What nobody asks for, with residuals weighted by their size sigma (n,) [rad]."""
-        here = self._error(x)
-        starts = [(self._error(x, _STEP * one) - here) / _STEP for one in np.eye(self._state.shape[1])]
-        self._others = np.zeros((*self._extra.shape, 0))
+        others: Array = np.zeros((0, *self._extra.shape))
         if self._free:
-            self._others = inertia_torques(self._model, self._path(x), self._pieces.step)
-        inertia = [(self._error(x, torque=_TORQUE * one) - here) / _TORQUE for one in np.moveaxis(self._others, -1, 0)]
-        shared = np.stack(inertia, axis=-1) if inertia else np.zeros((*here.shape, 0))
-        return Slack.of(-np.stack(starts, axis=-1), -shared, np.maximum(sigma, self._least))
+            self._inertia = Inertia.along(self._model, self._path(x), self._pieces.step)
+            self._extra = self._inertia.Y @ self._less
+            others = np.moveaxis(self._inertia.base, -1, 0)
+        here = self._error(x)
+        starts = [(here - self._error(x, _STEP * one)) / _STEP for one in np.eye(self._state.shape[1])]
+        shared = [(here - self._error(x, torque=_TORQUE * one)) / _TORQUE for one in others]
+        shared_change = np.stack(shared, axis=-1) if shared else np.zeros((*here.shape, 0))
+        return Slack.of(np.stack(starts, axis=-1), shared_change, np.maximum(sigma, self._least))
 
     def _rms(self, error: Array) -> Array:
         """Of each joint (n,) [rad]."""

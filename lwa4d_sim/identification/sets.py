@@ -45,6 +45,14 @@ class ParameterSet:
         return np.asarray(np.linalg.lstsq(self.combine, x, rcond=None)[0])
 
 
+def usual_columns(parameters: ParameterSet, unknowns: Unknowns) -> Array:
+    """Rms of the parameters' columns (r,) at random states: a measure of what is next to nothing."""
+    still = Unknowns(unknowns.chain, np.zeros(3), unknowns.kinds, unknowns.names, unknowns.units)
+    Y = random_regressor(unknowns)
+    weight = Y - random_regressor(still) if parameters.splits else None
+    return np.asarray(np.sqrt((parameters.columns(Y, weight) ** 2).mean(axis=(0, 1))))
+
+
 def base_set(unknowns: Unknowns, fixed: tuple[str, ...]) -> ParameterSet:
     """Base parameters of the unknowns that are not ``fixed``."""
     base = base_of(unknowns, fixed)

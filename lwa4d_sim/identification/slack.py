@@ -43,11 +43,12 @@ class Slack:
 
         Samples that are not there are 0 in both.
         """
-        weighted = (starts / sigma[:, None]).reshape(len(starts), -1, starts.shape[-1])
+        pieces, samples, n, _ = starts.shape
+        weighted = (starts / sigma[:, None]).reshape(pieces, samples * n, -1)
         U, inverse = _base(weighted)
-        all_of = (shared / sigma[:, None]).reshape(len(starts), -1, shared.shape[-1])
+        all_of = (shared / sigma[:, None]).reshape(pieces, samples * n, shared.shape[-1])
         left = all_of - U @ (U.swapaxes(1, 2) @ all_of)
-        base, back = _base(left.reshape(-1, shared.shape[-1]))
+        base, back = _base(left.reshape(pieces * samples * n, shared.shape[-1]))
         return Slack(sigma, U, inverse, all_of.reshape(base.shape), base, back)
 
     @property
@@ -57,16 +58,19 @@ class Slack:
 
     def left(self, error: Array) -> Array:
         """The part of errors (S, m, n) that is not explained."""
-        r = (error / self.sigma).reshape(len(error), -1, 1)
-        r = (r - self.starts @ (self.starts.swapaxes(1, 2) @ r)).ravel()
+        r = self._moving(error).ravel()
         return np.asarray((r - self.base @ (self.base.T @ r)).reshape(error.shape) * self.sigma)
 
     def explained(self, error: Array) -> tuple[Array, Array]:
         """Changes of starts (S, 2 n) and parameters (K,) that explain most."""
-        r = (error / self.sigma).reshape(len(error), -1, 1)
-        parameters = self.back @ (self.base.T @ (r - self.starts @ (self.starts.swapaxes(1, 2) @ r)).ravel())
-        r = r - (self.shared @ parameters).reshape(r.shape)
+        parameters = self.back @ (self.base.T @ self._moving(error).ravel())
+        r = (error / self.sigma).reshape(len(error), -1, 1) - (self.shared @ parameters).reshape(len(error), -1, 1)
         return (self.inverse @ (self.starts.swapaxes(1, 2) @ r))[..., 0], parameters
+
+    def _moving(self, error: Array) -> Array:
+        """Weighted errors (S, m n, 1) less what other starts explain."""
+        r = (error / self.sigma).reshape(len(error), -1, 1)
+        return np.asarray(r - self.starts @ (self.starts.swapaxes(1, 2) @ r))
 
 
 def _base(columns: Array) -> tuple[Array, Array]:
@@ -79,21 +83,29 @@ def _base(columns: Array) -> tuple[Array, Array]:
     return U * told[..., None, :], back
 
 
-def inertia_torques(model: Any, path: Array, step: float) -> Array:
-    """Torques (S, N, n, K) [N m] by which arms of other inertia differ along a path, of size 1 each.
+@dataclass(frozen=True)
+class Inertia:
+    """Torques by which arms of other inertia differ along a path: to first order, other links are as less torque.
 
-    To first order other links and rotors are the same as less torque, Y dpi; of all such torques this is a base.
-
-    Args:
-        model: compiled arm.
-        path: position and speed at the steps (S, N + 1, 2 n).
-        step: [s].
+    Attributes:
+        Y: with links' parameters, then rotors' inertia (S, N, n, 11 n).
+        base: all such torques, of rms 1 N m each (S, N, n, K) [N m].
+        back: from coordinates in it to parameters (11 n, K).
     """
-    n = model.njnt
-    middle, ddq = 0.5 * (path[:, :-1] + path[:, 1:]), np.diff(path[..., n:], axis=1) / step
-    rows = middle[..., :n].reshape(-1, n), middle[..., n:].reshape(-1, n), ddq.reshape(-1, n)
-    Y = Regressor(chain_of(model), np.array(model.opt.gravity)).torque(*rows)
-    Y = np.concatenate([Y, rows[2][..., None] * np.eye(n)], axis=-1).reshape(-1, 11 * n)
-    base = _base(Y)[0]
-    base = base[:, base.any(axis=0)] * np.sqrt(len(base))
-    return np.asarray(base.reshape(*ddq.shape, -1))
+
+    Y: Array
+    base: Array
+    back: Array
+
+    @staticmethod
+    def along(model: Any, path: Array, step: float) -> "Inertia":
+        """Of a compiled arm that goes through positions and speeds (S, N + 1, 2 n), one each ``step`` [s]."""
+        n = model.njnt
+        middle, ddq = 0.5 * (path[:, :-1] + path[:, 1:]), np.diff(path[..., n:], axis=1) / step
+        rows = middle[..., :n].reshape(-1, n), middle[..., n:].reshape(-1, n), ddq.reshape(-1, n)
+        Y = Regressor(chain_of(model), np.array(model.opt.gravity)).torque(*rows)
+        Y = np.concatenate([Y, rows[2][..., None] * np.eye(n)], axis=-1)
+        base, back = _base(Y.reshape(-1, 11 * n))
+        told, size = base.any(axis=0), np.sqrt(len(rows[0]))
+        base = size * base[:, told].reshape(*ddq.shape, -1)
+        return Inertia(Y.reshape(*ddq.shape, -1), base, size * back[:, told])

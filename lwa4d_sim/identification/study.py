@@ -15,7 +15,7 @@ from lwa4d_sim.identification.friction import Friction, friction_of
 from lwa4d_sim.identification.noise import Influence, influence
 from lwa4d_sim.identification.options import Identify
 from lwa4d_sim.identification.parameters import KINDS, Unknowns, unknowns_of
-from lwa4d_sim.identification.sets import ParameterSet, base_set, thesis_set
+from lwa4d_sim.identification.sets import ParameterSet, base_set, thesis_set, usual_columns
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.mjcf import torque_limits
 from lwa4d_sim.recordings.recording import Recording
@@ -39,6 +39,7 @@ class Problem:
         nominal: their values (P,).
         fixed: values of those that are not estimated, by name.
         parameters: that are estimated.
+        usual: rms of their columns (r,) when they are well excited.
         friction: law of Coulomb friction.
     """
 
@@ -48,6 +49,7 @@ class Problem:
     nominal: Array
     fixed: Mapping[str, float]
     parameters: ParameterSet
+    usual: Array
     friction: Friction
 
     @staticmethod
@@ -78,7 +80,8 @@ class Problem:
             parameters = thesis_set(unknowns, names, nominal)
         else:
             parameters = base_set(unknowns, names)
-        return Problem(options, model, unknowns, nominal, fixed, parameters, friction_of(model))
+        usual = usual_columns(parameters, unknowns)
+        return Problem(options, model, unknowns, nominal, fixed, parameters, usual, friction_of(model))
 
     def equations(self, recording: Recording, coulomb: Array) -> Equations:
         """Of a recording, given about the size of Coulomb friction (n,) [N m]."""
@@ -159,7 +162,7 @@ def fit_recording(problem: Problem, recording: Recording, like: "Fit | None" = N
         used = _used(problem, made)
         Y, b = problem.columns(made) * used[..., None], problem.torque(made) * used
         noise = None if problem.options.method != "total" else regressor_noise(problem, recording, made, used, coulomb)
-        estimate = fit(Y, b, prior, problem.options.method, noise)
+        estimate = fit(Y, b, prior, problem.usual, problem.options.method, noise)
         coulomb = problem.coulomb(problem.all_unknowns(estimate.nearest))
     if estimate.lost.all():
         raise IdentificationError(f"{recording.source}: the joints do not move enough to tell any parameter")
@@ -186,7 +189,8 @@ def regressor_noise(
     """Mean of E^T E (r + 1, r + 1) of the errors E that noise of the samples makes in the weighted [Y b]."""
     rng = np.random.default_rng(0)
     prior = problem.value(problem.nominal)
-    first = fit(problem.columns(made) * used[..., None], problem.torque(made) * used, prior)
+    Y, b = problem.columns(made) * used[..., None], problem.torque(made) * used
+    first = fit(Y, b, prior, problem.usual)
     root = np.sqrt(first.weights)[:, None]
     total = np.zeros((len(problem.parameters.names) + 1,) * 2)
     step = np.maximum(made.noise, 1e-12)

@@ -50,9 +50,11 @@ def headline(found: Findings) -> list[str]:
     seconds = found.recording.end - float(found.recording.t.min())
     told = f"All {n}" if len(well) == n else f"{len(well)} of {n}"
     head = f"{told} parameters are well told by {seconds:.3g} s of motion"
-    if honest(found, grade) is False:
+    if found.recording.shook:
+        head = "The estimate is not to be trusted: the loop shook while the data were taken"
+    elif honest(found, grade) is False:
         head = f"The estimate is not to be trusted: only {_holding(grade)}"
-    if well:
+    if well and not found.recording.shook:
         head += _furthest(found, grade, well)
     nrmse, joints = found.validation.nrmse, found.recording.joints
     best, before = (f"{percent(e.max())} ({joints[int(e.argmax())]})" for e in (nrmse["estimate"], nrmse["nominal"]))
@@ -77,7 +79,7 @@ def _furthest(found: Findings, grade: Grades, well: Sequence[int]) -> str:
 
 
 def details(found: Findings) -> list[str]:
-    """Sentences on what the data do not tell, on the intervals, on the written model, the bus, and the controllers."""
+    """Sentences on what the data do not tell, the intervals, the written model, the bus, and the controllers."""
     grade = grades(found)
     return [
         *_shaking(found),
@@ -93,15 +95,13 @@ def sound(found: Findings) -> bool:
     """Whether nothing speaks against it: calm motion, nothing lost, intervals right, torque better than before."""
     grade, nrmse = grades(found), found.validation.nrmse
     better = nrmse["estimate"].max() <= nrmse["nominal"].max()
-    return bool(
-        better and not found.recording.shook and not grade.rows(LOST) and honest(found, grade) is not False
-    )
+    return bool(better and not found.recording.shook and not grade.rows(LOST) and honest(found, grade) is not False)
 
 
 def _shaking(found: Findings) -> list[str]:
     if not found.recording.shook:
         return []
-    return ["The loop shook while the data were taken, faster than the filter lets pass: lower its gains."]
+    return ["What shakes faster than the filter lets pass spoils the equations: lower the gains, and repeat the run."]
 
 
 def _untold(found: Findings, grade: Grades) -> list[str]:
