@@ -428,3 +428,10 @@ def test_every_name_has_a_meaning() -> None:
     )
     assert all(meaning(name) for name in problem.unknowns.names)
     assert meaning("p1") == ""
+
+
+def test_a_loop_that_shook_is_not_to_be_trusted(simulated: Written) -> None:
+    found = replace(simulated.found, recording=replace(simulated.found.recording, shook=True))
+    assert headline(found)[0] == "The estimate is not to be trusted: the loop shook while the data were taken."
+    assert any("lower the gains" in text for text in details(found))
+    assert not sound(found)

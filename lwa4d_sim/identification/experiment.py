@@ -18,6 +18,7 @@ from lwa4d_sim.identification.study import (
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.mjcf import joint_facts, load_model, model_path
 from lwa4d_sim.record import RunLog
+from lwa4d_sim.recordings.plausible import FASTEST
 from lwa4d_sim.recordings.recording import Recording
 from lwa4d_sim.recordings.run_data import Signals, from_run
 from lwa4d_sim.runner import run
@@ -130,6 +131,11 @@ def _check(log: RunLog) -> None:
     where = f"run {log.name}, {log.variant}"
     if log.diverged_at is not None:
         raise IdentificationError(f"{where}: diverged at {log.diverged_at:.2f} s; its data tell nothing")
+    fastest = float(np.abs(log.dq).max())
+    if fastest > FASTEST:
+        raise IdentificationError(
+            f"{where}: a joint moves at {fastest:.4g} rad/s, more than {FASTEST:g}; the loop does not hold the arm"
+        )
     if log.stopped is not None:
         raise IdentificationError(f"{where}: stopped at {log.stopped[0]:.2f} s: {log.stopped[1]}")
 

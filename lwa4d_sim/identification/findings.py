@@ -170,7 +170,11 @@ def identify(
         first, second = held_out(first)
         clean = None if clean is None else held_out(clean)[0]
     advance()
-    found = fit_recording(problem, first)
+    try:
+        found = fit_recording(problem, first)
+    except IdentificationError as error:
+        where = experiment.scenario
+        raise error if error.key is None else where.locate(error, error.key, experiment.variant) from error
     identified = possible(problem, found)
     advance()
     experiment.write(identified, destination)

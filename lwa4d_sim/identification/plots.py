@@ -20,6 +20,7 @@ from lwa4d_sim.identification.words import joint_error, percent, squared
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.mjcf import joint_facts
 
+CLOSE = 1e-3  # assumed: spread of the curves below which they are drawn in parts per million
 CURVES = 8  # parameters whose course is drawn (assumed: colours that an eye can tell apart)
 TOGETHER = 4  # joints on one picture of torques (assumed: a page's height)
 COLOURS = (*PALETTE, GREY, BLACK)
@@ -132,15 +133,17 @@ def _course(ax: Axes, found: Findings) -> str:
     settled = share[len(share) // 4 :]
     low, high = (float(f(settled, initial=1.0)) for f in (np.nanmin, np.nanmax))
     room = max(0.5 * (high - low), 1e-6)
+    over = "final value" if found.truth is None else "true value"
+    label, goes_to = f"estimate / {over}", 1.0
+    if high - low + room < CLOSE:  # parts per million of what is left, for an axis cannot show 1.000001
+        share, low, high, room = 1e6 * (share - 1.0), 1e6 * (low - 1.0), 1e6 * (high - 1.0), 1e6 * room
+        label, goes_to = f"estimate off the {over} [ppm]", 0.0
     for k, column, colour in zip(picked, share.T, COLOURS, strict=False):
         value = f"{found.fit.estimate.x[k]:.4g} {squared(parameters.units[k])}"
         ax.plot(t, column, color=colour, lw=1.5, label=f"{plain(parameters.names[k])} = {value}")
-    ax.axhline(1.0, color=BLACK, ls="--", lw=1.2, zorder=4)
+    ax.axhline(goes_to, color=BLACK, ls="--", lw=1.2, zorder=4)
     ax.set_title("C  estimated parameters", fontsize="medium", loc="left")
-    over = "final value" if found.truth is None else "true value"
-    ax.set(
-        xlabel="time [s]", ylabel=f"estimate / {over}", xlim=(0.0, found.recording.end), ylim=(low - room, high + room)
-    )
+    ax.set(xlabel="time [s]", ylabel=label, xlim=(0.0, found.recording.end), ylim=(low - room, high + room))
     ax.legend(fontsize=SMALL, loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=3, handlelength=1.4)
     return (
         ""

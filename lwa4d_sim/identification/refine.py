@@ -30,6 +30,7 @@ MOST = 24  # pieces; those of a longer recording are thinned out: seven joints t
 _ROUNDS, _ITERATIONS = 6, 15  # of what goes along, and of the parameters in each (assumed; three and two are usual)
 _STEP = 1e-6  # of finite differences, in SI units: half-way between rounding and curvature (derived: sqrt of 1e-12)
 _TORQUE = 1e-3  # [N m], of differences with torque (assumed: likewise)
+_USUAL = 0.01  # share of the torque that is usually wrong by wrong inertia (assumed)
 _SETTLED = 0.2  # standard errors by which a parameter may still move (assumed)
 _GRADIENT = 0.05 * _SETTLED  # likewise, of the fit itself (assumed; below it rounding hides what is gained)
 _DAMP = 10.0  # factor on the fit's damping (Marquardt 1963)
@@ -145,6 +146,7 @@ class _Fit:
         self._state = self._pieces.state
         self._model, self._free = model, "inertia" in what
         self._inertia: Inertia | None = None
+        self._usual = _USUAL * float(np.sqrt((self._pieces.torque(np.zeros(recording.n)) ** 2).mean()))
         self._less = np.zeros(11 * recording.n)
         self._extra = np.zeros((len(self._state), self._pieces.steps, recording.n))
         self._least = np.maximum(recording.position_step / np.sqrt(12.0), _STILL)
@@ -237,7 +239,7 @@ class _Fit:
         starts = [(here - self._error(x, _STEP * one)) / _STEP for one in np.eye(self._state.shape[1])]
         shared = [(here - self._error(x, torque=_TORQUE * one)) / _TORQUE for one in others]
         shared_change = np.stack(shared, axis=-1) if shared else np.zeros((*here.shape, 0))
-        return Slack.of(np.stack(starts, axis=-1), shared_change, np.maximum(sigma, self._least))
+        return Slack.of(np.stack(starts, axis=-1), shared_change, np.maximum(sigma, self._least), self._usual)
 
     def _rms(self, error: Array) -> Array:
         """Of each joint (n,) [rad]."""

@@ -38,17 +38,18 @@ class Slack:
     back: Array
 
     @staticmethod
-    def of(starts: Array, shared: Array, sigma: Array) -> "Slack":
+    def of(starts: Array, shared: Array, sigma: Array, usual: float) -> "Slack":
         """From the change of positions with each start (S, m, n, 2 n) and each parameter (S, m, n, K).
 
-        Samples that are not there are 0 in both.
+        Samples that are not there are 0 in both. Parameters, or combinations of them, that the samples tell no better
+        than their ``usual`` size are left alone.
         """
         pieces, samples, n, _ = starts.shape
         weighted = (starts / sigma[:, None]).reshape(pieces, samples * n, -1)
-        U, inverse = _base(weighted)
+        U, inverse = _base(weighted, SEEN)
         all_of = (shared / sigma[:, None]).reshape(pieces, samples * n, shared.shape[-1])
         left = all_of - U @ (U.swapaxes(1, 2) @ all_of)
-        base, back = _base(left.reshape(pieces * samples * n, shared.shape[-1]))
+        base, back = _base(left.reshape(pieces * samples * n, shared.shape[-1]), SEEN, 1.0 / usual)
         return Slack(sigma, U, inverse, all_of.reshape(base.shape), base, back)
 
     @property
@@ -73,12 +74,15 @@ class Slack:
         return np.asarray(r - self.starts @ (self.starts.swapaxes(1, 2) @ r))
 
 
-def _base(columns: Array) -> tuple[Array, Array]:
-    """Orthonormal base of columns (..., M, K), 0 where it has none, and what leads back to them (..., K, K)."""
+def _base(columns: Array, share: float, least: float = 0.0) -> tuple[Array, Array]:
+    """Orthonormal base of columns (..., M, K), 0 where it has none, and what leads back to them (..., K, K).
+
+    What is shorter than ``least``, or than a ``share`` of the longest of columns of equal length, counts as none.
+    """
     length = np.linalg.norm(columns, axis=-2, keepdims=True)
-    length = np.where(length > 0, length, 1.0)
+    length = np.where(length > 0, length, 1.0) if least == 0.0 else np.ones_like(length)
     U, s, Vt = np.linalg.svd(columns / length, full_matrices=False)
-    told = s > SEEN * s[..., :1]
+    told = (s > share * s[..., :1]) & (s > least)
     back = Vt.swapaxes(-1, -2) * (told / np.where(told, s, 1.0))[..., None, :] / length.swapaxes(-1, -2)
     return U * told[..., None, :], back
 
@@ -105,7 +109,7 @@ class Inertia:
         rows = middle[..., :n].reshape(-1, n), middle[..., n:].reshape(-1, n), ddq.reshape(-1, n)
         Y = Regressor(chain_of(model), np.array(model.opt.gravity)).torque(*rows)
         Y = np.concatenate([Y, rows[2][..., None] * np.eye(n)], axis=-1)
-        base, back = _base(Y.reshape(-1, 11 * n))
+        base, back = _base(Y.reshape(-1, 11 * n), SEEN)
         told, size = base.any(axis=0), np.sqrt(len(rows[0]))
         base = size * base[:, told].reshape(*ddq.shape, -1)
         return Inertia(Y.reshape(*ddq.shape, -1), base, size * back[:, told])

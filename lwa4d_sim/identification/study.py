@@ -21,6 +21,7 @@ from lwa4d_sim.mjcf import torque_limits
 from lwa4d_sim.recordings.recording import Recording
 
 FEWEST_SLIDING = 0.2  # assumed: share of a joint's rows below which those in which it turns or sticks are used as well
+SURE = 1e3  # assumed: how much better than by all data together a known unknown of a link is known
 PASSES = 2  # of the fit: the first says how slowly a joint may slide
 # How far a joint's parameter usually is from its nominal value, as a share of the peak torque: assumed from the wrist's
 # friction and rotors, which are 0.01 to 0.25 of it (`lwa4d_sim.arm.WRIST`).
@@ -164,6 +165,8 @@ def fit_recording(problem: Problem, recording: Recording, like: "Fit | None" = N
         noise = None if problem.options.method != "total" else regressor_noise(problem, recording, made, used, coulomb)
         estimate = fit(Y, b, prior, problem.usual, problem.options.method, noise)
         coulomb = problem.coulomb(problem.all_unknowns(estimate.nearest))
+    if "gain" in problem.unknowns.kinds:
+        _check_gains(problem, made, used)
     if estimate.lost.all():
         raise IdentificationError(f"{recording.source}: the joints do not move enough to tell any parameter")
     x = problem.all_unknowns(estimate.nearest)
@@ -181,6 +184,31 @@ def _used(problem: Problem, made: Equations) -> NDArray[np.bool_]:
     )
     used = made.sliding | ~with_friction
     return np.asarray(used | (used.mean(axis=0) < FEWEST_SLIDING))
+
+
+def _check_gains(problem: Problem, made: Equations, used: NDArray[np.bool_]) -> None:
+    """Refuse gains that the known unknowns do not fix: with all gains and parameters zero every torque is explained.
+
+    Noise hides that, so torques are looked at that have none: those of the nominal arm on the same motion.
+    """
+    given = np.array([problem.fixed.get(name, 0.0) for name in problem.unknowns.names])
+    free = np.where([name in problem.fixed for name in problem.unknowns.names], given, problem.nominal)
+    columns = problem.unknowns.columns("gain")
+    Y = made.Y.copy()
+    Y[:, np.arange(problem.unknowns.n), columns] = 0.0
+    Y[:, np.arange(problem.unknowns.n), columns] = -(Y @ free)
+    exact = problem.columns(replace(made, Y=Y)) * used[..., None]
+    prior = problem.value(problem.nominal)
+    lost = fit(exact, exact @ prior, prior, problem.usual).lost
+    names = zip(problem.parameters.names, lost, strict=True)
+    unknown = [name for name, gone in names if gone and name.endswith(".gain")]
+    if unknown:
+        example = unknown[0].replace("gain", "viscous")
+        raise IdentificationError(
+            f"cannot tell {', '.join(unknown)} from the size of everything else; give what is known of a part that "
+            f"those joints move, such as identify.known={{{example}: 4.0}}",
+            "identify.joints",
+        )
 
 
 def regressor_noise(
@@ -205,15 +233,20 @@ def regressor_noise(
 
 def possible(problem: Problem, found: Fit) -> Array:
     """Unknowns (P,) of the physically possible arm that fits best; what the data do not tell is nominal."""
-    u = problem.unknowns
-    Y, b = found.equations.Y, problem.torque(found.equations)
-    root = (np.sqrt(found.estimate.weights) * found.used)[..., None]
-    free = np.array([name not in problem.fixed for name in u.names])
-    prior = problem.nominal.copy()
-    for name, value in problem.fixed.items():
-        prior[u.names.index(name)] = value
-    rows = np.concatenate([Y * root * free, b[..., None] * root], axis=-1).reshape(-1, len(free) + 1)
-    R = np.asarray(np.linalg.qr(rows, mode="r"))
+    u, made = problem.unknowns, found.equations
+    inertial = np.arange(len(u.names)) < 10 * u.n
+    fixed = np.array([name in problem.fixed for name in u.names])
+    given = np.array([problem.fixed.get(name, 0.0) for name in u.names])
+    free = inertial | ~fixed
+    prior = np.where(free, problem.nominal, given)
+    root = np.sqrt(found.estimate.weights) * found.used
+    rows = np.concatenate([made.Y * free, (made.b - made.Y @ np.where(free, 0.0, given))[..., None]], axis=-1)
+    rows = (rows * root[..., None]).reshape(-1, len(free) + 1)
+    # what is known of the links is measured, too, and much better than all else: the nominal arm need not agree with it
+    known = np.flatnonzero(inertial & fixed)
+    sure = SURE * max(float(np.linalg.norm(rows[:, :-1], axis=0).max()), 1.0)
+    pins = sure * np.concatenate([np.eye(len(free))[known], given[known, None]], axis=1)
+    R = np.asarray(np.linalg.qr(np.concatenate([rows, pins]), mode="r"))
     peak = torque_limits(problem.model)
     peak = np.where(np.isfinite(peak), peak, np.nanmax(np.where(np.isfinite(peak), peak, np.nan), initial=100.0))
     usual = np.concatenate([peak * USUAL[kind] if kind in USUAL else np.full(u.n, USUAL_GAIN) for kind in u.kinds])

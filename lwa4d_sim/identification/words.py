@@ -110,8 +110,8 @@ def _untold(found: Findings, grade: Grades) -> list[str]:
     out = []
     if lost:
         out.append(
-            f"The data do not tell {listed(lost)}: no number is given, and the written model has what the nominal arm "
-            "has."
+            f"The data do not tell {listed(lost)}: no number is given, and what the written model has in their place "
+            "comes from the nominal arm."
         )
     if weak:
         out.append(
