@@ -10,7 +10,8 @@ LwaError
 ├── TrajectoryError (ValueError)  a motion that cannot be built from what was asked
 ├── RecordError (OSError)         a record cannot be written or read
 ├── BusError (OSError)            a bus, a node on it, or what it said, is not as it must be
-└── SweepError (ValueError)       a sweep cannot go on: another sweep's folder, too many runs, a cluster that is gone
+├── SweepError (ValueError)       a sweep cannot go on: another sweep's folder, too many runs, a cluster that is gone
+└── IdentificationError (ValueError)  data that are no recording, or do not tell what was asked of them
 """
 
 

@@ -82,7 +82,7 @@ ROWS = (
     "identification.inertia identification.regressor identification.friction identification.smooth",
     "identification.parameters identification.estimate identification.consistent",
     "identification.base identification.equations identification.model_file",
-    "identification.sets identification.noise",
+    "identification.sets identification.noise identification.slack",
     "identification.study identification.shooting identification.adjustable",
     "identification.experiment identification.refine",
     "identification.findings identification.sources",

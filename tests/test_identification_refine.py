@@ -115,7 +115,8 @@ def test_delay_and_quadratic_friction_are_found_together(folder: Path, nominal: 
 def test_where_there_is_nothing_to_find_zero_is_found(nominal: Path, plain: Recording) -> None:
     found = refine(nominal, plain, what=SHAPE, segment=SEGMENT)
     assert errors(found, {}).max() < 3.0
-    assert found.after == pytest.approx(found.before, rel=0.05)
+    assert (found.after < found.before).all()
+    assert found.before == pytest.approx(COUNT / np.sqrt(12), rel=0.3), "the encoder's rounding, and guessed starts"
     assert dict(zip(found.names, found.std_error, strict=True))["delay"] < 1e-5
 
 
@@ -136,12 +137,11 @@ def test_each_joint_has_its_delay_offset_and_mass(nominal: Path) -> None:
 def test_a_delay_is_found_behind_wrong_inertia(nominal: Path) -> None:
     """Two roads to one model: its masses known, and its inertia fitted along."""
     recording = recorded(nominal, 0.003, mass_scale=(0.97, 1.02))
-    biased = replace(recording, tau=recording.tau + np.array([0.1, -0.1]))
-    fixed = refine(nominal, biased, what=("delay", "offset"), segment=SEGMENT)
-    assert abs(fixed.estimate[0] - 0.003) > 2e-4, "what is taken as exact has to be"
-    along = refine(nominal, biased, what=("delay", "offset", "inertia"), segment=SEGMENT)
-    assert errors(along, {"delay": 0.003, "joint2.offset": 0.1, "joint4.offset": -0.1}).max() < 3.0
+    fixed = refine(nominal, recording, what=("delay",), segment=SEGMENT)
+    along = refine(nominal, recording, what=("delay", "inertia"), segment=SEGMENT)
+    assert errors(along, {"delay": 0.003}).max() < 3.0
     assert abs(along.estimate[0] - 0.003) < 2e-5
+    assert abs(fixed.estimate[0] - 0.003) > 6e-5, "what is taken as exact has to be"
     # of 450 samples 43 go into starts and inertia, which leaves 0.95 of the encoder's rounding; and chance
     assert along.after == pytest.approx(0.95 * COUNT / np.sqrt(12), rel=0.1)
 
@@ -292,7 +292,7 @@ def bad() -> Iterator[tuple[str, dict[str, Any], dict[str, Any]]]:
 def test_bad_input_is_one_line(
     nominal: Path, plain: Recording, said: str, recording: dict[str, Any], call: dict[str, Any]
 ) -> None:
-    changes = {k: np.full_like(plain.q, v) if k in ("q", "tau") else v for k, v in recording.items()}
+    changes: dict[str, Any] = {k: np.full_like(plain.q, v) if k in ("q", "tau") else v for k, v in recording.items()}
     with pytest.raises(IdentificationError, match=said) as error:
         refine(**{"model_path": nominal, "recording": replace(plain, **changes), **call})
     assert "\n" not in str(error.value)

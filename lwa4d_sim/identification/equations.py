@@ -9,7 +9,7 @@ and a torque that is held between instants enters exactly (weak form, modulating
 the signal after one and the same zero-phase filter, with the bump as its impulse response.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -151,7 +151,7 @@ def _matrix(unknowns: Unknowns, motion: Motion, F: Any, dF: Any, b: Array, direc
     p, l = Regressor(unknowns.chain, unknowns.gravity).momentum(motion.q, motion.dq)
     inertial = -(dF @ p.reshape(len(p), -1)) - F @ l.reshape(len(l), -1)
     Y[..., : 10 * n] = inertial.reshape(W, n, 10 * n)
-    own = {
+    own: dict[str, Callable[[], Any]] = {
         "viscous": lambda: F @ motion.dq,
         "coulomb": lambda: F @ direction,
         "offset": lambda: np.ones((W, n)),

@@ -11,6 +11,7 @@ from lwa4d_sim.errors import IdentificationError
 from lwa4d_sim.identification.experiment import Experiment, held_out, noisy
 from lwa4d_sim.identification.friction import friction_of
 from lwa4d_sim.identification.options import MeasurementNoise
+from lwa4d_sim.identification.refine import Refined, refine
 from lwa4d_sim.identification.study import (
     Fit,
     Problem,
@@ -83,7 +84,7 @@ class Findings:
     coverage: Array | None = None
     repeats: int = 0
     tried: Mapping[str, Mapping[str, Any]] | None = None
-    refined: Any = None
+    refined: Refined | None = None
     remarks: tuple[str, ...] = ()
 
 
@@ -185,6 +186,7 @@ def identify(
         coverage = covered(problem, clean, options.noise, found, truth, repeats, advance)
     moved = bias(problem, first, found)
     advance()
+    refined = refine(destination, first) if options.refine else None
     tried = None if options.control is None or data is not None else experiment.tried(options.control, destination)
     advance()
     return Findings(
@@ -201,6 +203,7 @@ def identify(
         coverage=coverage,
         repeats=repeats,
         tried=tried,
+        refined=refined,
         remarks=first.remarks,
     )
 

@@ -26,10 +26,11 @@ from lwa4d_sim.mjcf import load_model
 from lwa4d_sim.mjcf_checks import name_of
 from lwa4d_sim.recordings.recording import Recording
 
-MOST = 24  # pieces; those of a longer recording are thinned out: seven joints then take about a minute (measured)
-_ROUNDS, _ITERATIONS = 6, 15  # of what goes along, and of the parameters in each (assumed; three and two are usual)
+MOST = 16  # pieces; those of a longer recording are thinned out, for seven joints take minutes (measured)
+_ROUNDS, _ITERATIONS = 5, 4  # of what goes along, and of the parameters in each (measured: three and two are usual)
 _STEP = 1e-6  # of finite differences, in SI units: half-way between rounding and curvature (derived: sqrt of 1e-12)
-_TORQUE = 1e-3  # [N m], of differences with torque (assumed: likewise)
+_START = (1e-4, 0.02)  # [rad], [rad/s]; how far the spline's guess of a start usually is off (assumed)
+_SHARE = 1e-2  # of usual amounts, by which differences are taken: 1e-6 rad and more
 _USUAL = 0.01  # share of the torque that is usually wrong by wrong inertia (assumed)
 _SETTLED = 0.2  # standard errors by which a parameter may still move (assumed)
 _GRADIENT = 0.05 * _SETTLED  # likewise, of the fit itself (assumed; below it rounding hides what is gained)
@@ -50,7 +51,7 @@ class Refined:
         estimate: values after; NaN where the motion does not tell.
         std_error: the larger of two: for residuals that are independent, and for residuals that depend on each other
             within a piece; inf where the motion does not tell.
-        before: rms of the position error (n,) [rad], the starts of the pieces fitted.
+        before: rms of the position error (n,) [rad], with what goes along fitted.
         after: likewise.
         pieces: number of pieces.
         remarks: one sentence each.
@@ -87,7 +88,7 @@ def refine(
             rotors, to first order, which is fitted along and not told. What is not named is taken as exact.
         segment: length of a piece [s].
         threads: that run the model.
-        advance: called after each iteration; there are at most 96, usually a dozen.
+        advance: called after each iteration; there are at most 25, usually half as many.
 
     Raises:
         IdentificationError: mujoco.sysid is not installed; the recording is too short, or of another arm; the model
@@ -146,7 +147,8 @@ class _Fit:
         self._state = self._pieces.state
         self._model, self._free = model, "inertia" in what
         self._inertia: Inertia | None = None
-        self._usual = _USUAL * float(np.sqrt((self._pieces.torque(np.zeros(recording.n)) ** 2).mean()))
+        self._amount = _SHARE * np.repeat(_START, recording.n)
+        self._usual = _SHARE * _USUAL * float(np.sqrt((self._pieces.torque(np.zeros(recording.n)) ** 2).mean()))
         self._less = np.zeros(11 * recording.n)
         self._extra = np.zeros((len(self._state), self._pieces.steps, recording.n))
         self._least = np.maximum(recording.position_step / np.sqrt(12.0), _STILL)
@@ -170,9 +172,9 @@ class _Fit:
             if settled:
                 break
             starts, inertia = self._slack.explained(error)
-            self._state = self._state + starts
+            self._state = self._state + starts * self._amount / _SHARE
             if self._inertia is not None:
-                self._less = self._less + self._inertia.back @ inertia
+                self._less = self._less + self._inertia.back @ inertia * self._usual / _SHARE
             self._slack = self._linearise(x, after)
         return Refined(
             names=tuple(self._params.keys()),
@@ -236,10 +238,10 @@ class _Fit:
             self._extra = self._inertia.Y @ self._less
             others = np.moveaxis(self._inertia.base, -1, 0)
         here = self._error(x)
-        starts = [(here - self._error(x, _STEP * one)) / _STEP for one in np.eye(self._state.shape[1])]
-        shared = [(here - self._error(x, torque=_TORQUE * one)) / _TORQUE for one in others]
+        starts = [here - self._error(x, self._amount * one) for one in np.eye(self._state.shape[1])]
+        shared = [here - self._error(x, torque=self._usual * one) for one in others]
         shared_change = np.stack(shared, axis=-1) if shared else np.zeros((*here.shape, 0))
-        return Slack.of(np.stack(starts, axis=-1), shared_change, np.maximum(sigma, self._least), self._usual)
+        return Slack.of(np.stack(starts, axis=-1) / _SHARE, shared_change / _SHARE, np.maximum(sigma, self._least))
 
     def _rms(self, error: Array) -> Array:
         """Of each joint (n,) [rad]."""

@@ -12,9 +12,7 @@ from lwa4d_sim.identification.regressor import Regressor
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.mjcf import chain_of
 
-# Least share of the largest effect that is told from the errors of differences (assumed: they are 1e-6 of an effect,
-# and what is that much smaller than the rest changes nothing)
-SEEN = 1e-6
+SEEN = 1e-6  # least torque, of columns of length 1, that is told from rounding and differences in time (assumed)
 
 
 @dataclass(frozen=True)
@@ -24,7 +22,7 @@ class Slack:
     Attributes:
         sigma: size of each joint's errors (n,) [rad], one over their weight.
         starts: orthonormal base for each piece (S, m n, 2 n).
-        inverse: from coordinates in it to starts (S, 2 n, 2 n).
+        inverse: from coordinates in it to starts, in usual amounts (S, 2 n, 2 n).
         shared: weighted change with the parameters (S m n, K).
         base: orthonormal base (S m n, K) of what the starts leave of it.
         back: from coordinates in it to parameters (K, K).
@@ -38,18 +36,17 @@ class Slack:
     back: Array
 
     @staticmethod
-    def of(starts: Array, shared: Array, sigma: Array, usual: float) -> "Slack":
-        """From the change of positions with each start (S, m, n, 2 n) and each parameter (S, m, n, K).
+    def of(starts: Array, shared: Array, sigma: Array) -> "Slack":
+        """From the change of positions by usual amounts of each start (S, m, n, 2 n) and each parameter (S, m, n, K).
 
-        Samples that are not there are 0 in both. Parameters, or combinations of them, that the samples tell no better
-        than their ``usual`` size are left alone.
+        Samples that are not there are 0 in both. What changes the positions by less than their errors, if it is off by
+        as much as usual, is left alone: an estimate of it would be further off.
         """
         pieces, samples, n, _ = starts.shape
-        weighted = (starts / sigma[:, None]).reshape(pieces, samples * n, -1)
-        U, inverse = _base(weighted, SEEN)
+        U, inverse = _base((starts / sigma[:, None]).reshape(pieces, samples * n, -1), least=1.0)
         all_of = (shared / sigma[:, None]).reshape(pieces, samples * n, shared.shape[-1])
         left = all_of - U @ (U.swapaxes(1, 2) @ all_of)
-        base, back = _base(left.reshape(pieces * samples * n, shared.shape[-1]), SEEN, 1.0 / usual)
+        base, back = _base(left.reshape(pieces * samples * n, shared.shape[-1]), least=1.0)
         return Slack(sigma, U, inverse, all_of.reshape(base.shape), base, back)
 
     @property
@@ -63,7 +60,7 @@ class Slack:
         return np.asarray((r - self.base @ (self.base.T @ r)).reshape(error.shape) * self.sigma)
 
     def explained(self, error: Array) -> tuple[Array, Array]:
-        """Changes of starts (S, 2 n) and parameters (K,) that explain most."""
+        """Changes of starts (S, 2 n) and parameters (K,) that explain most, in usual amounts."""
         parameters = self.back @ (self.base.T @ self._moving(error).ravel())
         r = (error / self.sigma).reshape(len(error), -1, 1) - (self.shared @ parameters).reshape(len(error), -1, 1)
         return (self.inverse @ (self.starts.swapaxes(1, 2) @ r))[..., 0], parameters
@@ -74,16 +71,14 @@ class Slack:
         return np.asarray(r - self.starts @ (self.starts.swapaxes(1, 2) @ r))
 
 
-def _base(columns: Array, share: float, least: float = 0.0) -> tuple[Array, Array]:
+def _base(columns: Array, least: float) -> tuple[Array, Array]:
     """Orthonormal base of columns (..., M, K), 0 where it has none, and what leads back to them (..., K, K).
 
-    What is shorter than ``least``, or than a ``share`` of the longest of columns of equal length, counts as none.
+    A direction in which the columns are no longer than ``least`` counts as none.
     """
-    length = np.linalg.norm(columns, axis=-2, keepdims=True)
-    length = np.where(length > 0, length, 1.0) if least == 0.0 else np.ones_like(length)
-    U, s, Vt = np.linalg.svd(columns / length, full_matrices=False)
-    told = (s > share * s[..., :1]) & (s > least)
-    back = Vt.swapaxes(-1, -2) * (told / np.where(told, s, 1.0))[..., None, :] / length.swapaxes(-1, -2)
+    U, s, Vt = np.linalg.svd(columns, full_matrices=False)
+    told = s > least
+    back = Vt.swapaxes(-1, -2) * (told / np.where(told, s, 1.0))[..., None, :]
     return U * told[..., None, :], back
 
 
@@ -109,7 +104,10 @@ class Inertia:
         rows = middle[..., :n].reshape(-1, n), middle[..., n:].reshape(-1, n), ddq.reshape(-1, n)
         Y = Regressor(chain_of(model), np.array(model.opt.gravity)).torque(*rows)
         Y = np.concatenate([Y, rows[2][..., None] * np.eye(n)], axis=-1)
-        base, back = _base(Y.reshape(-1, 11 * n), SEEN)
+        flat = Y.reshape(-1, 11 * n)
+        length = np.linalg.norm(flat, axis=0)
+        length = np.where(length > 0, length, 1.0)
+        base, back = _base(flat / length, least=SEEN)
         told, size = base.any(axis=0), np.sqrt(len(rows[0]))
         base = size * base[:, told].reshape(*ddq.shape, -1)
-        return Inertia(Y.reshape(*ddq.shape, -1), base, size * back[:, told])
+        return Inertia(Y.reshape(*ddq.shape, -1), base, size * back[:, told] / length[:, None])
