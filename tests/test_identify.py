@@ -214,7 +214,7 @@ def test_total_least_squares_is_offered_and_agrees_where_noise_is_small(call: Ca
 
 
 def test_what_is_known_of_a_link_need_not_be_what_the_nominal_arm_has(call: Call) -> None:
-    """A first moment 1.8 times the nominal one, which no mass distribution of the nominal mass and inertia could have."""
+    """A first moment 1.8 times the nominal one, which no body of the nominal mass and inertia could have."""
     known = "identify.known={link4.hz: 1.4645}"
     found = answer(call, "short.yaml", "--no-plots", "--set", "identify.parameters=base", "--set", known)
     model = standard_parameters(load_model(str(Path(found["folder"]) / "identified.xml")))
