@@ -1,6 +1,7 @@
 """Delay, friction's shape and masses, found again from motion; and what a recording cannot tell."""
 
 import logging
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -55,6 +56,7 @@ loop: {{kind: sampled, period: 0.01, position_resolution: 1.7453e-5, latency: {{
 def arm(folder: Path, **changes: tuple[float, tuple[float, ...], float]) -> Path:
     """The planar arm with armature, damping polynomial and friction loss at its joints."""
     text = model_path("lwa4d_planar").read_text(encoding="utf-8")
+    text = re.sub(r'<asset>.*</asset>|material="\w+"', "", text, flags=re.DOTALL)  # textures take time to compile
     for joint, (armature, damping, coulomb) in {**JOINTS, **changes}.items():
         tag = f'<joint name="{joint}"'
         assert tag in text
