@@ -54,7 +54,7 @@ def calibrate(
     if angle_noise is not None:
         _require("--angle-noise", angle_noise, 1e-9, 0.1)
     model = ErrorModel(chain_of(load_model(arm)))
-    folder = claim_for(arm, out)
+    folder = claim_for(arm, out, poses)
     with busy(f"calibrating {arm}", quiet=as_json):
         if poses is not None:
             data = read_poses(poses, model)

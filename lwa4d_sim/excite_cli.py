@@ -12,6 +12,8 @@ from lwa4d_sim.errors import ScenarioError
 
 LEAD_IN, LEAD_OUT = 0.5, 0.2  # of the period, where not given (assumed: time to go as far as half a period goes)
 
+SLOWEST = 0.001  # [rad/s] assumed
+
 
 def excite(
     file: Annotated[str, typer.Argument(metavar="FILE", help="Scenario file, or the name of a shipped one.")],
@@ -89,9 +91,12 @@ def excite(
 
 def _numbers(text: str | None) -> list[float] | None:
     try:
-        return None if text is None else [float(part) for part in text.split(",")]
+        numbers = None if text is None else [float(part) for part in text.split(",")]
     except ValueError:
         raise ScenarioError(f"--speed (={text}): must be numbers [rad/s] with commas between them") from None
+    if numbers is not None and min(numbers) < SLOWEST:
+        raise ScenarioError(f"--speed (={text}): must be at least {SLOWEST:g} rad/s; slower motion tells nothing")
+    return numbers
 
 
 def _print(answer: dict[str, Any]) -> None:

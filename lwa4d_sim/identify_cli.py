@@ -57,7 +57,10 @@ def identify(
         raise ScenarioError("--repeats draws noise for a simulated arm; it does not go with --data")
     scenario = Scenario.load(scenario_path(file), dict(override(text) for text in overrides or []))
     experiment = Experiment.of(scenario, variant)
-    folder = claim_for(scenario, out)
+    given = [path for path in (data, validation_data, *(eds or [])) if path is not None]
+    if data is not None and validation_data is not None and data.resolve() == validation_data.resolve():
+        raise ScenarioError(f"--validation-data {validation_data}: must be another motion than --data")
+    folder = claim_for(scenario, out, given)
     with tempfile.TemporaryDirectory() as scratch:
         model = Path(scratch) / "identified.xml"
         recordings = None
@@ -74,7 +77,7 @@ def identify(
     if as_json:
         print(json.dumps(answer))
         return
-    _print(found, answer)
+    _print(found, answer, report=not no_plots)
     print(f"model: {folder / 'identified.xml'}")
     if not no_plots:
         print(f"report: {folder / 'report.html'}")
@@ -86,11 +89,11 @@ def _told_again(data: Path | None, second: Path | None, sheets: list[Path] | Non
     return [word for option, value in named if value is not None for word in (option, str(value))]
 
 
-def _print(found: Any, answer: dict[str, Any]) -> None:
+def _print(found: Any, answer: dict[str, Any], *, report: bool) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from lwa4d_sim.identification.words import headline
+    from lwa4d_sim.identification.words import details, headline
 
     rows = list(answer["parameters"].items())
     shown = sorted(rows, key=_doubt)[:_FEW] if len(rows) > _FEW else rows
@@ -107,8 +110,9 @@ def _print(found: Any, answer: dict[str, Any]) -> None:
             table.add_row(name, *forms, row["unit"], row["words"])
     Console(width=None if sys.stdout.isatty() else 160, highlight=False, markup=False).print(table)
     if len(shown) < len(rows):
-        print(f"({len(rows) - len(shown)} more, less certain ones, in the report)")
-    for text in headline(found):
+        where = "the report" if report else "parameters.yaml"
+        print(f"({len(rows) - len(shown)} more, less certain ones, in {where})")
+    for text in (*headline(found), *details(found), *(f"note: {remark}" for remark in found.remarks)):
         print(text)
 
 

@@ -83,7 +83,8 @@ ROWS = (
     "identification.parameters identification.estimate identification.consistent",
     "identification.base identification.equations identification.model_file",
     "identification.sets identification.noise identification.slack",
-    "identification.study identification.shooting identification.adjustable",
+    "identification.problem identification.shooting identification.adjustable",
+    "identification.study",
     "identification.experiment identification.refine",
     "identification.findings identification.sources",
     # a motion that tells much
@@ -159,7 +160,6 @@ LIBRARIES = {
         "excitation.search",
         "identification.consistent",
         "identification.equations",
-        "identification.estimate",
         "identification.noise",
         "identification.refine",
         "identification.smooth",

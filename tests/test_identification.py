@@ -332,15 +332,15 @@ def test_total_least_squares_has_no_bias_where_the_ordinary_has() -> None:
     rng = np.random.default_rng(0)
     true, noise = rng.normal(size=(20000, 1, 2)), 0.3 * rng.normal(size=(20000, 1, 2))
     noise[..., 1] = 0.0
-    Y, b = true + noise, true @ np.array([2.0, -1.0]) + 0.01 * rng.normal(size=(20000, 1))
+    Y, b = true + noise, true @ np.array([2.0, -1.0]) + 3.0 * rng.normal(size=(20000, 1))
     plain = fit(Y, b, np.zeros(2), np.ones(2))
-    assert plain.x[0] == pytest.approx(2.0 / 1.09, rel=0.01)
-    spread = np.diag([0.09, 0.0, 1e-4]) * 20000 * plain.weights[0]
-    np.testing.assert_allclose(fit(Y, b, np.zeros(2), np.ones(2), "total", spread).x, [2.0, -1.0], rtol=0.01)
+    assert plain.x[0] == pytest.approx(2.0 / 1.09, rel=0.03)
+    spread = np.diag([0.09, 0.0, 0.0]) * 20000 * plain.weights[0]  # of b it need not know
+    np.testing.assert_allclose(fit(Y, b, np.zeros(2), np.ones(2), "total", spread).x, [2.0, -1.0], rtol=0.04)
 
 
 def test_unknown_names_are_refused_with_those_that_exist() -> None:
-    from lwa4d_sim.identification.study import Problem
+    from lwa4d_sim.identification.problem import Problem
 
     with pytest.raises(IdentificationError, match=r"there are link2\.m, "):
         Problem.of(Identify(known={"link9.m": 1.0}), load_model("lwa4d_planar"))

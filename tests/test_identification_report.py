@@ -28,9 +28,9 @@ from lwa4d_sim.identification.model_file import write_model
 from lwa4d_sim.identification.options import Identify
 from lwa4d_sim.identification.parameter_plots import WRONG, draw_parameters
 from lwa4d_sim.identification.plots import draw_motions
+from lwa4d_sim.identification.problem import Problem
 from lwa4d_sim.identification.refine import Refined
 from lwa4d_sim.identification.report import digits, write_identification_page
-from lwa4d_sim.identification.study import Problem
 from lwa4d_sim.identification.words import details, headline, listed, meaning, percent, sound
 from lwa4d_sim.mjcf import load_model, model_path
 from lwa4d_sim.page import NONE

@@ -4,6 +4,7 @@ import json
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,11 +14,12 @@ import pytest
 from lwa4d_sim import Scenario, cli, run
 from lwa4d_sim.identification.estimate import INTERVAL
 from lwa4d_sim.identification.experiment import Experiment, noisy
-from lwa4d_sim.identification.findings import covered, validate
+from lwa4d_sim.identification.findings import bias, covered, validate
 from lwa4d_sim.identification.inertia import pseudo_inertia, standard_parameters
 from lwa4d_sim.identification.options import MeasurementNoise
 from lwa4d_sim.identification.regressor import Regressor
 from lwa4d_sim.identification.study import fit_recording, possible
+from lwa4d_sim.interfaces import Array
 from lwa4d_sim.mjcf import chain_of, load_model
 
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
@@ -161,6 +163,10 @@ def test_what_stands_still_is_said_and_has_no_number(call: Call) -> None:
         (["--set", "identify.known={link9.m: 1.0}"], r"identify.*link9.m.*there are link2\.m"),
         (["--set", "identify.joints=[rust]"], r"identify.joints.*viscous"),
         (["--set", "identify.bandwidth=0"], r"identify.bandwidth"),
+        (["--set", "identify.bandwidth=12"], "too few for a bandwidth of 12 Hz; at most 8.33 Hz"),
+        (["--set", "identify.noise.torque=[1, 2, 3]"], "identify.noise.torque.*has 3 values for 2 joints"),
+        (["--set", "identify={known: {link4.m: -4.0}}"], "identify.known.link4.m.*is no m"),
+        (["--set", "identify.known={link4.m: 4.0}"], "use parameters: base"),
         (["--set", "trajectory.duration=0.3", "--set", "trajectory.lead_in=0"], "too short for a bandwidth of 5 Hz"),
         (["--set", "controller.kp=3000", "--set", "controller.kd=300"], "the loop does not hold the arm"),
         (["--set", "identify={joints: [gain]}"], r"identify.joints.*joint4.gain.*known={joint2.viscous: 4.0}"),
@@ -234,3 +240,88 @@ def test_gains_of_drives_are_found_beside_a_known_parameter(call: Call) -> None:
     found = answer(call, "short.yaml", "--data", "gain.csv", "--no-plots", *options)
     assert found["parameters"]["joint4.gain"]["estimate"] == pytest.approx(0.1, abs=2e-3)
     assert found["parameters"]["joint2.gain"]["estimate"] == pytest.approx(0.0, abs=2e-3)
+
+
+def table_of(log: Any, name: str, t: Array | None = None, tau: Array | None = None) -> None:
+    """Write what the controller's side of a run knew as a table."""
+    rows = [log.ticks.t if t is None else t, log.ticks.q, log.ticks.tau if tau is None else tau]
+    np.savetxt(name, np.column_stack(rows), delimiter=",", header="t,q1,q2,tau1,tau2", comments="")
+
+
+def test_uneven_time_stamps_and_lost_rows(call: Call) -> None:
+    """Stamps that stray, and a third of the rows lost: the estimate gets worse, and nothing breaks."""
+    log = run(Scenario.load("short.yaml"))
+    rng = np.random.default_rng(3)
+    table_of(log, "jitter.csv", t=log.ticks.t + rng.uniform(-0.002, 0.002, len(log.ticks.t)))
+    found = answer(call, "short.yaml", "--data", "jitter.csv", "--no-plots")
+    assert found["parameters"]["p5"]["estimate"] == pytest.approx(7.789, rel=0.02)
+    rows = Path("jitter.csv").read_text().splitlines()
+    kept = [rows[0], *(row for row in rows[1:] if rng.random() > 0.3)]
+    Path("lost.csv").write_text("\n".join(kept) + "\n")
+    assert call("short.yaml", "--data", "lost.csv", "--no-plots").code in (0, 2)
+
+
+def test_torques_of_the_wrong_sign_are_not_to_be_trusted(call: Call) -> None:
+    log = run(Scenario.load("short.yaml"))
+    table_of(log, "flipped.csv", tau=-log.ticks.tau)
+    found = answer(call, "short.yaml", "--data", "flipped.csv", "--no-plots")
+    assert not found["sound"]
+    assert "look at signs" in " ".join(found["verdict"])
+
+
+def test_data_are_never_overwritten_by_results(call: Call) -> None:
+    log = run(Scenario.load("short.yaml"))
+    folder = Path("runs/short-identify")
+    folder.mkdir(parents=True)
+    table_of(log, str(folder / "mine.csv"))
+    for arguments in (["--data", str(folder / "mine.csv")], []):
+        result = call("short.yaml", *arguments, "--no-plots")
+        assert result.code == 2
+        assert "choose another folder with -o" in result.err
+    assert (folder / "mine.csv").is_file()
+
+
+def test_a_controller_that_knows_no_gravity_does_not_take_it_from_the_arm(call: Call) -> None:
+    """A plain PD believes that nothing weighs anything; the arm hangs in the world all the same."""
+    plain = "controller.model={gravity: [0.0, 0.0, 0.0]}"
+    found = answer(call, "short.yaml", "--no-plots", "--set", plain)
+    for name, row in found["parameters"].items():
+        assert row["estimate"] == pytest.approx(REAL[name], rel=1e-3)
+
+
+@pytest.mark.parametrize("method", ["weighted", "total"])
+def test_noisy_torques_do_not_bias_any_method(method: str) -> None:
+    experiment = Experiment.of(Scenario.parse(SHORT, overrides={"identify.method": method}), None)
+    problem, clean = experiment.problem, experiment.simulated()
+    truth = problem.value(experiment.truth())
+    z = []
+    for repeat in range(40):
+        found = fit_recording(problem, noisy(clean, MeasurementNoise(torque=1.0), repeat))
+        z.append((found.estimate.x - truth) / found.std_error)
+    assert np.abs(np.mean(z, axis=0)).max() < 4.0 / np.sqrt(40)
+    assert np.mean(np.abs(z) < INTERVAL) == pytest.approx(0.95, abs=0.05)
+
+
+def test_noisy_torques_do_not_draw_gains_to_nothing() -> None:
+    """With the measured torque as its column, a gain of -1 would explain every torque."""
+    arm = SHORT.replace("{parameters: thesis, joints: []}", "{joints: [viscous, gain], known: {joint2.viscous: 4.0}}")
+    text = arm.replace("controller:", "plant: {friction: {viscous: 4.0}}\ncontroller:")
+    text += "  # the nominal arm knows friction as well\n"
+    scenario = Scenario.parse(text, overrides={"identify.nominal": {"friction": {"viscous": 4.0}}})
+    experiment = Experiment.of(scenario, None)
+    problem, clean = experiment.problem, experiment.simulated()
+    found = fit_recording(problem, noisy(clean, MeasurementNoise(torque=1.0), 1))
+    z = (found.estimate.x - problem.value(experiment.truth())) / found.std_error
+    assert np.abs(z).max() < 4.5
+
+
+def test_a_latency_that_is_ignored_moves_the_estimate_as_the_table_says(call: Call) -> None:
+    """What `bias` promises against what happens: a record with 4 ms of latency, and the same without it told."""
+    scenario = Scenario.load("short.yaml", {"loop.latency": 0.004})
+    experiment = Experiment.of(scenario, None)
+    recording = experiment.simulated()
+    found = fit_recording(experiment.problem, recording)
+    promised = bias(experiment.problem, recording, found)["command latency ignored"]
+    untold = fit_recording(experiment.problem, replace(recording, since=recording.t)).estimate.x
+    np.testing.assert_allclose(untold - found.estimate.x, promised, rtol=1e-3, atol=1e-6)
+    assert np.abs(promised / found.estimate.x).max() > 0.002

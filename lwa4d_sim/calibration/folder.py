@@ -13,9 +13,11 @@ from lwa4d_sim.yaml_text import dump
 _OURS = (".csv", ".png", ".xml", ".yaml")  # what such a folder may hold, and what the next one replaces
 
 
-def claim_for(arm: str, out: Path) -> Path:
-    """The folder for an arm's calibration in ``out``, see `folders.claim`."""
-    return claim(out / f"{Path(arm).stem}-calibration", _OURS)
+def claim_for(arm: str, out: Path, poses: Path | None = None) -> Path:
+    """The folder for an arm's calibration in ``out``, see `folders.claim`; the file of poses must not lie in it."""
+    name = Path(arm).stem
+    names = (f"{name}_calibrated.xml", "parameters.yaml", "poses.csv", "poses_held_out.csv")
+    return claim(out / f"{name}-calibration", _OURS, () if poses is None else (poses,), names)
 
 
 def write_study(folder: Path, study: Study, arm: str, found: dict[str, Any]) -> None:

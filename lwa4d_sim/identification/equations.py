@@ -109,6 +109,13 @@ def equations(
     splines: list[Spline] = []
     for t, q in zip(recording.t.T, recording.q.T, strict=True):
         splines.append(Spline.through(t, q, 1.0 / (KNOT_RATE * bandwidth), splines[-1] if splines else None))
+    if any(spline.noise is None for spline in splines):
+        highest = 1.0 / (1.5 * KNOT_RATE * recording.period)
+        raise IdentificationError(
+            f"{recording.source}: samples every {recording.period:.4g} s are too few for a bandwidth of "
+            f"{bandwidth:g} Hz; at most {highest:.3g} Hz is possible",
+            "identify.bandwidth",
+        )
     start = max(recording.since[0].max(), *(spline.t[0] for spline in splines)) + width
     end = min(recording.end, *(spline.t[-1] for spline in splines)) - width
     count = int((end - start) / width) - 3  # a bump is four intervals wide
@@ -140,7 +147,7 @@ def equations(
     weight = _weight(unknowns, motion, F) if gravity else None
     sliding = F @ (np.abs(friction.effort(motion.dq, motion.ddq, coulomb)) < SURELY) < 1e-9
     step = recording.position_step / np.sqrt(12.0)
-    noise = np.array([step[j] if s.noise is None else max(s.noise, step[j]) for j, s in enumerate(splines)])
+    noise = np.array([max(spline.noise or 0.0, step[j]) for j, spline in enumerate(splines)])
     return Equations(unknowns, middles[kept], Y, b, weight, motion, F, dF, A, noise, sliding)
 
 

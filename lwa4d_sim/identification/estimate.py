@@ -12,6 +12,7 @@ from lwa4d_sim.interfaces import Array
 
 INTERVAL = 1.959963984540054  # standard errors on each side of a 95 % interval (normal distribution)
 RANK = 1e-7  # least singular value of scaled columns that is told from rounding, over the largest (assumed)
+FEWEST = 4  # assumed: equations for each parameter
 DARK = 1e-4  # share of a parameter that may lie in what the data do not tell and still count as rounding (assumed)
 
 
@@ -55,9 +56,10 @@ def fit(
     Raises:
         IdentificationError: fewer equations than parameters.
     """
-    W, n, r = Y.shape
-    if W * n < 2 * r:
-        raise IdentificationError(f"{W * n} equations are too few for {r} parameters; at least {2 * r} are needed")
+    n, r = Y.shape[1:]
+    rows = int(Y.any(axis=-1).sum())
+    if rows < FEWEST * r:
+        raise IdentificationError(f"{rows} equations are too few for {r} parameters; at least {FEWEST * r} are needed")
     rest = b - Y @ prior
     Y = np.where(np.sqrt((Y**2).mean(axis=(0, 1))) > RANK * usual, Y, 0.0)
     weights: Array = np.ones(n)
@@ -95,22 +97,23 @@ def _weights(residual: Array, b: Array) -> Array:
 
 
 def _total(Y: Array, b: Array, weights: Array, noise: Array | None, told: NDArray[np.bool_]) -> Array:
-    """Total least squares with errors of known shape: the direction of [Y b] with least signal over noise."""
-    from scipy.linalg import eigh
+    """Total least squares with errors of known size: normal equations less what the errors add to them.
 
+    Raises:
+        IdentificationError: the errors are not known, or as large as what they are errors of.
+    """
     if noise is None:
         raise IdentificationError("total least squares needs to know how noisy the regressor is")
     root = np.sqrt(weights)
     A = np.concatenate([Y, b[..., None]], axis=-1) * root[:, None]
     A = A.reshape(-1, A.shape[-1])
     both = np.append(told, True)
-    N = noise[np.ix_(both, both)]
-    scale = np.linalg.norm(A, axis=0)
-    N = N / np.outer(scale, scale)
-    # an exact column has no noise: give it a little, as the problem needs a positive definite one
-    _, vectors = eigh((A / scale).T @ (A / scale), N + 1e-9 * np.trace(N) * np.eye(len(N)), subset_by_index=(0, 0))
-    v = vectors[:, 0] / scale
-    return np.asarray(-v[:-1] / v[-1])
+    G = A.T @ A - noise[np.ix_(both, both)]
+    scale = np.linalg.norm(A, axis=0)[:-1]
+    G, right = G[:-1, :-1] / np.outer(scale, scale), G[:-1, -1] / scale
+    if np.linalg.eigvalsh(G)[0] <= 0:
+        raise IdentificationError("the positions are too noisy for total least squares: nothing is left of the motion")
+    return np.asarray(np.linalg.solve(G, right) / scale)
 
 
 def recursive(Y: Array, b: Array, weights: Array, forgetting: float = 1.0) -> Iterator[Array]:

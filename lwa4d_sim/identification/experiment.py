@@ -12,9 +12,7 @@ from lwa4d_sim.controllers.belief import Belief, believed_model
 from lwa4d_sim.errors import IdentificationError, ModelError, ScenarioError
 from lwa4d_sim.identification.model_file import write_model
 from lwa4d_sim.identification.options import Identify, MeasurementNoise
-from lwa4d_sim.identification.study import (
-    Problem,
-)
+from lwa4d_sim.identification.problem import Problem
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.mjcf import joint_facts, load_model, model_path
 from lwa4d_sim.record import RunLog
@@ -23,7 +21,7 @@ from lwa4d_sim.recordings.recording import Recording
 from lwa4d_sim.recordings.run_data import Signals, from_run
 from lwa4d_sim.runner import run
 from lwa4d_sim.scenario import Scenario
-from lwa4d_sim.settings import IdealLoop, Settings
+from lwa4d_sim.settings import Settings
 
 HELD_OUT = 0.25  # assumed: share of a recording that is kept for validation where there is no second one
 
@@ -59,9 +57,17 @@ class Experiment:
         settings = scenario.variants[name]
         options = settings.identify or Identify()
         believed: Belief = getattr(settings.controller, "model", Belief())
-        belief = options.nominal or believed
+        # how the arm stands is known, whatever a controller is told of it
+        belief = replace(options.nominal or believed, gravity=settings.plant.gravity)
         try:
             problem = Problem.of(options, believed_model(belief, settings.arm, scenario.folder))
+            for what in ("position", "torque"):
+                given = getattr(options.noise, what)
+                if isinstance(given, tuple) and len(given) != problem.unknowns.n:
+                    raise IdentificationError(
+                        f"has {len(given)} values for {problem.unknowns.n} joints; give one number or as many",
+                        f"identify.noise.{what}",
+                    )
             return Experiment(scenario, name, options, belief, problem)
         except (IdentificationError, ModelError, ScenarioError) as error:
             raise scenario.locate(error, "identify", name) from error
@@ -78,10 +84,19 @@ class Experiment:
             IdentificationError: the arm did not stay on its motion.
         """
         log = self._run({} if motion is None else {"trajectory": asdict(motion)})
-        signals: Signals = "plant" if isinstance(self.settings.loop, IdealLoop) else "bus"
-        facts = joint_facts(self.problem.model)
+        return self.recording_of(log)
+
+    def recording_of(self, log: RunLog) -> Recording:
+        """What a run leaves to identification.
+
+        Raises:
+            IdentificationError: the arm did not stay on its motion.
+        """
         _check(log)
-        return replace(from_run(log, signals, facts), shook=not log.metrics()["stable"])
+        ideal = log.scenario.get("loop", {}).get("kind") == "ideal"
+        signals: Signals = "plant" if ideal else "bus"
+        recording = from_run(log, signals, joint_facts(self.problem.model))
+        return replace(recording, shook=not log.metrics()["stable"])
 
     def truth(self) -> Array:
         """Unknowns (P,) of the simulated arm."""

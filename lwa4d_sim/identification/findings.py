@@ -11,16 +11,18 @@ from lwa4d_sim.errors import IdentificationError
 from lwa4d_sim.identification.experiment import Experiment, held_out, noisy
 from lwa4d_sim.identification.friction import friction_of
 from lwa4d_sim.identification.options import MeasurementNoise
+from lwa4d_sim.identification.problem import Problem
 from lwa4d_sim.identification.refine import Refined, refine
 from lwa4d_sim.identification.study import (
     Fit,
-    Problem,
     convergence,
     covers,
     fit_recording,
     nrmse,
     possible,
     predicted,
+    refitted,
+    without_noise,
 )
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.mjcf import load_model
@@ -95,21 +97,29 @@ def bias(problem: Problem, recording: Recording, found: Fit) -> dict[str, Array]
     lags = recording.since - recording.t
     if (lags > 1e-9).any():
         delayed = replace(recording, since=recording.t.copy())
-        made["command latency ignored"] = fit_recording(problem, delayed, found).estimate.x - x
+        made["command latency ignored"] = refitted(problem, delayed, found) - x
     sampled = replace(recording, since=recording.since - 0.5 * period, end=recording.end - 0.5 * period)
-    made["torque taken as sampled, not held"] = fit_recording(problem, sampled, found).estimate.x - x
+    made["torque taken as sampled, not held"] = refitted(problem, sampled, found) - x
     if np.ptp(recording.t, axis=1).max() > 1e-9:
         together = replace(recording, t=np.repeat(recording.t.min(axis=1, keepdims=True), recording.n, axis=1))
-        made["time stamps of the joints ignored"] = fit_recording(problem, together, found).estimate.x - x
+        made["time stamps of the joints ignored"] = refitted(problem, together, found) - x
     if (found.equations.noise > 0).any():
         # noise once more: what it does to the mean, it has done once already (simulation extrapolation, Cook 1994)
         rng = np.random.default_rng(0)
         shifts = []
         for _ in range(AGAIN):
             again = replace(recording, q=recording.q + found.equations.noise * rng.normal(size=recording.q.shape))
-            shifts.append(fit_recording(problem, again, found).estimate.x - x)
+            shifts.append(refitted(problem, again, found) - x)
         made["noise and quantisation of the positions"] = np.mean(shifts, axis=0)
     return made
+
+
+def _acting(problem: Problem, recording: Recording, found: Fit) -> Recording:
+    """The recording with the torques that acted, where the drives' gains were found."""
+    if "gain" not in problem.unknowns.kinds:
+        return recording
+    gains = problem.all_unknowns(found.estimate.nearest)[problem.unknowns.columns("gain")]
+    return replace(recording, tau=recording.tau * (1.0 + gains))
 
 
 def validate(problem: Problem, recording: Recording, found: Fit, identified: Array, model: Any) -> Validation:
@@ -125,6 +135,9 @@ def validate(problem: Problem, recording: Recording, found: Fit, identified: Arr
     there = replace(problem, friction=friction_of(model))
     made = there.equations(recording, problem.coulomb(identified))
     before = problem.equations(recording, problem.coulomb(problem.nominal))
+    if "gain" in problem.unknowns.kinds:
+        x = problem.all_unknowns(found.estimate.nearest)
+        made, before = without_noise(there, made, x), without_noise(problem, before, problem.nominal)
     predictions = {
         "estimate": predicted(problem, made, found.estimate.nearest),
         "identified": made.Y @ identified,
@@ -186,7 +199,7 @@ def identify(
         coverage = covered(problem, clean, options.noise, found, truth, repeats, advance)
     moved = bias(problem, first, found)
     advance()
-    refined = refine(destination, first) if options.refine else None
+    refined = refine(destination, _acting(problem, first, found)) if options.refine else None
     tried = None if options.control is None or data is not None else experiment.tried(options.control, destination)
     advance()
     return Findings(

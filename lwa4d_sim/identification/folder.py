@@ -13,7 +13,7 @@ import numpy as np
 from lwa4d_sim.assembly import versions
 from lwa4d_sim.folders import claim, written_whole
 from lwa4d_sim.identification.findings import Findings
-from lwa4d_sim.identification.grades import grades
+from lwa4d_sim.identification.grades import LOST, grades
 from lwa4d_sim.identification.model_file import write_model
 from lwa4d_sim.identification.report import command, write_identification_page
 from lwa4d_sim.identification.words import details, headline, interval, meaning, sound
@@ -21,12 +21,19 @@ from lwa4d_sim.recordings.recording import Recording
 from lwa4d_sim.scenario import Scenario
 from lwa4d_sim.yaml_text import dump
 
+_NAMES = ("torque.csv", "identified.xml", "parameters.yaml", "identification.json", "report.html")
 _OURS = (".csv", ".html", ".json", ".png", ".xml", ".yaml")  # what such a folder may hold, and the next one replaces
 
 
-def claim_for(scenario: Scenario, out: Path) -> Path:
-    """The folder for a scenario's results in ``out``, see `folders.claim`."""
-    return claim(out / f"{scenario.name}-identify", _OURS)
+def claim_for(scenario: Scenario, out: Path, inputs: Sequence[Path] = ()) -> Path:
+    """The folder for a scenario's results in ``out``, see `folders.claim`.
+
+    Args:
+        scenario: the scenario.
+        out: where results go.
+        inputs: files that must not lie in that folder, for it is replaced.
+    """
+    return claim(out / f"{scenario.name}-identify", _OURS, inputs, _NAMES)
 
 
 def write_findings(folder: Path, found: Findings, model: Path, *, plots: bool = True, data: Sequence[str] = ()) -> None:
@@ -141,8 +148,8 @@ def _parameters(found: Findings) -> dict[str, dict[str, Any]]:
     for k, name in enumerate(p.names):
         ends = interval(found, k)
         made[name] = {
-            "estimate": _plain(x[k]),
-            "std_error": _plain(s[k]),
+            "estimate": None if told[k] == LOST else _plain(x[k]),
+            "std_error": None if told[k] == LOST else _plain(s[k]),
             "interval": None if ends is None else list(ends),
             "truth": None if found.truth is None else _plain(found.truth[k]),
             "unit": p.units[k],

@@ -6,11 +6,13 @@ import numpy as np
 
 from lwa4d_sim.identification.estimate import INTERVAL
 from lwa4d_sim.identification.findings import Findings
-from lwa4d_sim.identification.study import USUAL, USUAL_GAIN, Problem
+from lwa4d_sim.identification.problem import Problem
+from lwa4d_sim.identification.study import USUAL, USUAL_GAIN
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.mjcf import torque_limits
 
 WELL, WEAK, LOST = "well", "weakly", "not"  # told, by the data
+NOTHING = 30.0  # assumed: sizes that half an interval may be wide before the number in its middle says nothing at all
 UNLIMITED = 100.0  # [N m] assumed where the model states no peak torque, as in `study.possible`
 
 
@@ -21,7 +23,8 @@ class Grades:
     Attributes:
         size: a value (r,) that such a parameter of such an arm may well have, in its own unit.
         half: half the width of the 95 % interval (r,); NaN where the data do not tell.
-        told: ``WELL`` where ``half`` is below ``size``, ``WEAK`` where not, ``LOST`` where there is no estimate.
+        told: ``WELL`` where ``half`` is below ``size``, ``WEAK`` where not, ``LOST`` where there is no
+            estimate, or one with an interval `NOTHING` times as wide as that.
         error: estimate minus truth (r,), NaN where there is either not.
     """
 
@@ -39,10 +42,10 @@ def grades(found: Findings) -> Grades:
     """How well the data tell each parameter."""
     estimate, half = found.fit.estimate, INTERVAL * found.fit.std_error
     size = sizes(found.problem)
-    told = tuple(
-        LOST if lost else WELL if h <= s else WEAK for lost, h, s in zip(estimate.lost, half, size, strict=True)
-    )
-    error = np.full(len(size), np.nan) if found.truth is None else estimate.x - found.truth
+    lost = estimate.lost | (half > NOTHING * size)
+    half = np.where(lost, np.nan, half)
+    told = tuple(LOST if gone else WELL if h <= s else WEAK for gone, h, s in zip(lost, half, size, strict=True))
+    error = np.full(len(size), np.nan) if found.truth is None else np.where(lost, np.nan, estimate.x - found.truth)
     return Grades(size, half, told, error)
 
 

@@ -26,6 +26,7 @@ from lwa4d_sim.mjcf import load_model
 from lwa4d_sim.mjcf_checks import name_of
 from lwa4d_sim.recordings.recording import Recording
 
+STEP = 0.001  # [s] of the model's own run, in RK4 (as the plant's default); a coarser file would show as a delay
 MOST = 16  # pieces; those of a longer recording are thinned out, for seven joints take minutes (measured)
 _ROUNDS, _ITERATIONS = 5, 4  # of what goes along, and of the parameters in each (measured: three and two are usual)
 _STEP = 1e-6  # of finite differences, in SI units: half-way between rounding and curvature (derived: sqrt of 1e-12)
@@ -135,11 +136,12 @@ class _Fit:
         import mujoco
         from mujoco.rollout import Rollout
 
-        model = load_model(str(path))
+        model = load_model(str(path), timestep=STEP, integrator="RK4")
         if model.njnt != recording.n:
             raise IdentificationError(f"{recording.source}: has {recording.n} joints, the arm has {model.njnt}")
         self._sysid, self._source = sysid, recording.source
         self._spec = mujoco.MjSpec.from_file(str(path))
+        self._spec.option.timestep, self._spec.option.integrator = STEP, mujoco.mjtIntegrator.mjINT_RK4
         self._spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self._joints = [name_of(model, "JOINT", j) for j in range(model.njnt)]
         self._params, self._units = adjustable(sysid, self._spec, what)

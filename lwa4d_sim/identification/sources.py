@@ -4,16 +4,38 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from lwa4d_sim.errors import IdentificationError
 from lwa4d_sim.identification.experiment import Experiment
 from lwa4d_sim.mjcf import joint_facts
 from lwa4d_sim.recordings.recording import Recording
 from lwa4d_sim.settings import CanopenLoop
 
+FAR_BEYOND = 10.0  # assumed: peak torques that no measurement exceeds
 TABLES, RECORDS, SHEETS = (".csv", ".parquet"), (".h5", ".hdf5"), (".eds", ".dcf")
 
 
 def read_data(path: Path, experiment: Experiment, sheets: Sequence[Path]) -> Recording:
+    """Read a file of measured data; arguments and errors as `_read`.
+
+    Raises:
+        IdentificationError: torques are far beyond what the joints can have.
+    """
+    recording = _read(path, experiment, sheets)
+    for name, (_, _, peak), tau in zip(
+        recording.joints, joint_facts(experiment.problem.model), recording.tau.T, strict=True
+    ):
+        largest = float(np.nanmax(np.abs(tau)))
+        if largest > FAR_BEYOND * peak:
+            raise IdentificationError(
+                f"{path}: the torque of {name} reaches {largest:.4g} N m, where its motor has {peak:g}; "
+                "check the units (identify.table.torque, identify.can.torque_counts)"
+            )
+    return recording
+
+
+def _read(path: Path, experiment: Experiment, sheets: Sequence[Path]) -> Recording:
     """Read a file of measured data.
 
     Args:
@@ -35,10 +57,8 @@ def read_data(path: Path, experiment: Experiment, sheets: Sequence[Path]) -> Rec
         return read_table(path, facts, experiment.options.table)
     if ending in RECORDS:
         from lwa4d_sim.record import RunLog
-        from lwa4d_sim.recordings.run_data import from_run
 
-        log = RunLog.load(path)
-        return from_run(log, "plant" if log.period == log.timestep else "bus", facts)
+        return experiment.recording_of(RunLog.load(path))
     from lwa4d_sim.bus.joints import joints_for
     from lwa4d_sim.recordings.can_log import read_can_log
 

@@ -1,121 +1,28 @@
-"""Identification from recordings: equations, estimate, what it is worth, the possible arm nearest to it, validation."""
+"""A recording fitted: estimate, what it is worth, the possible arm nearest to it, and what torque it predicts."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lwa4d_sim.errors import IdentificationError
 from lwa4d_sim.identification.consistent import consistent
-from lwa4d_sim.identification.equations import Equations, equations
+from lwa4d_sim.identification.equations import Equations
 from lwa4d_sim.identification.estimate import INTERVAL, Estimate, fit, recursive
-from lwa4d_sim.identification.friction import Friction, friction_of
 from lwa4d_sim.identification.noise import Influence, influence
-from lwa4d_sim.identification.options import Identify
-from lwa4d_sim.identification.parameters import KINDS, Unknowns, unknowns_of
-from lwa4d_sim.identification.sets import ParameterSet, base_set, thesis_set, usual_columns
+from lwa4d_sim.identification.problem import Problem
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.mjcf import torque_limits
 from lwa4d_sim.recordings.recording import Recording
 
 FEWEST_SLIDING = 0.2  # assumed: share of a joint's rows below which those in which it turns or sticks are used as well
+GAIN_PASSES, SETTLED = 20, 1e-6  # likewise where drive gains are fitted, which are not linear (three are usual)
 SURE = 1e3  # assumed: how much better than by all data together a known unknown of a link is known
 PASSES = 2  # of the fit: the first says how slowly a joint may slide
 # How far a joint's parameter usually is from its nominal value, as a share of the peak torque: assumed from the wrist's
 # friction and rotors, which are 0.01 to 0.25 of it (`lwa4d_sim.arm.WRIST`).
 USUAL = {"viscous": 0.25, "coulomb": 0.1, "offset": 0.02, "armature": 0.01}
 USUAL_GAIN = 0.1  # assumed
-
-
-@dataclass(frozen=True)
-class Problem:
-    """What is asked of an arm.
-
-    Attributes:
-        options: of the scenario.
-        model: the nominal arm, compiled.
-        unknowns: of the arm.
-        nominal: their values (P,).
-        fixed: values of those that are not estimated, by name.
-        parameters: that are estimated.
-        usual: rms of their columns (r,) when they are well excited.
-        friction: law of Coulomb friction.
-    """
-
-    options: Identify
-    model: Any
-    unknowns: Unknowns
-    nominal: Array
-    fixed: Mapping[str, float]
-    parameters: ParameterSet
-    usual: Array
-    friction: Friction
-
-    @staticmethod
-    def of(options: Identify, model: Any) -> "Problem":
-        """The problem that ``options`` set for a nominal arm.
-
-        Raises:
-            IdentificationError: an unknown is named that the arm does not have, or the parameters are another arm's.
-        """
-        gain = ("gain",) if "gain" in options.joints else ()
-        kinds = tuple(kind for kind in KINDS if kind != "gain" or gain)
-        unknowns = unknowns_of(model, kinds)
-        nominal = unknowns.values(model)
-        for name in options.known:
-            if name not in unknowns.names:
-                raise IdentificationError(
-                    f"no unknown of that name; there are {', '.join(unknowns.names)}", f"identify.known.{name}"
-                )
-        taken = {
-            unknowns.names[k]: float(nominal[k])
-            for kind in kinds
-            if kind not in options.joints
-            for k in unknowns.columns(kind)
-        }
-        fixed = {**taken, **options.known}
-        names = tuple(fixed)
-        if options.parameters == "thesis":
-            parameters = thesis_set(unknowns, names, nominal)
-        else:
-            parameters = base_set(unknowns, names)
-        usual = usual_columns(parameters, unknowns)
-        return Problem(options, model, unknowns, nominal, fixed, parameters, usual, friction_of(model))
-
-    def equations(self, recording: Recording, coulomb: Array) -> Equations:
-        """Of a recording, given about the size of Coulomb friction (n,) [N m]."""
-        splits = self.parameters.splits
-        return equations(recording, self.unknowns, self.options.bandwidth, self.friction, coulomb, gravity=splits)
-
-    def columns(self, made: Equations) -> Array:
-        """The parameters' regressor (W, n, r)."""
-        return self.parameters.columns(made.Y, made.gravity)
-
-    def torque(self, made: Equations) -> Array:
-        """What is left of the torque (W, n) when the fixed unknowns have had their part."""
-        values = np.array([self.fixed.get(name, 0.0) for name in self.unknowns.names])
-        return np.asarray(made.b - made.Y @ values)
-
-    def coulomb(self, unknowns: Array) -> Array:
-        """Size of Coulomb friction (n,) [N m] among values of the unknowns (P,)."""
-        return np.maximum(unknowns[self.unknowns.columns("coulomb")], 0.0)
-
-    def all_unknowns(self, x: Array) -> Array:
-        """Some values of the unknowns (P,) with parameters ``x`` (r,)."""
-        values = self.parameters.unknowns(x)
-        for name, value in self.fixed.items():
-            values[self.unknowns.names.index(name)] = value
-        return values
-
-    def value(self, unknowns: Array) -> Array:
-        """The parameters (r,) of values of the unknowns (P,)."""
-        return np.asarray(self.parameters.combine @ self._free(unknowns))
-
-    def _free(self, unknowns: Array) -> Array:
-        fixed = [name in self.fixed for name in self.unknowns.names]
-        return np.where(fixed, 0.0, unknowns)
 
 
 @dataclass(frozen=True)
@@ -158,22 +65,51 @@ def fit_recording(problem: Problem, recording: Recording, like: "Fit | None" = N
     """
     coulomb = problem.coulomb(problem.nominal if like is None else problem.all_unknowns(like.estimate.nearest))
     prior = problem.value(problem.nominal)
-    for _ in range(PASSES if like is None else 1):
+    gains = "gain" in problem.unknowns.kinds
+    x = problem.nominal if like is None else problem.all_unknowns(like.estimate.nearest)
+    for _ in range((GAIN_PASSES if gains else PASSES) if like is None else 1):
         made = problem.equations(recording, coulomb)
+        if gains:
+            made = without_noise(problem, made, x)
         used = _used(problem, made)
         Y, b = problem.columns(made) * used[..., None], problem.torque(made) * used
         noise = None if problem.options.method != "total" else regressor_noise(problem, recording, made, used, coulomb)
         estimate = fit(Y, b, prior, problem.usual, problem.options.method, noise)
-        coulomb = problem.coulomb(problem.all_unknowns(estimate.nearest))
-    if "gain" in problem.unknowns.kinds:
+        before, x = x, problem.all_unknowns(estimate.nearest)
+        coulomb = problem.coulomb(x)
+        if gains and np.abs(x - before)[problem.unknowns.columns("gain")].max() < SETTLED:
+            break
+    if gains:
         _check_gains(problem, made, used)
     if estimate.lost.all():
         raise IdentificationError(f"{recording.source}: the joints do not move enough to tell any parameter")
-    x = problem.all_unknowns(estimate.nearest)
     spread = influence(made, used, x, estimate.gain) if like is None else like.influence
     torque_noise = spread.torque_noise(estimate.residual, made.noise, int((~estimate.lost).sum()))
     torque_noise = np.maximum(torque_noise, recording.torque_step / np.sqrt(12.0))
     return Fit(made, used, estimate, torque_noise, spread, spread.covariance(made.noise, torque_noise))
+
+
+def refitted(problem: Problem, recording: Recording, like: Fit) -> Array:
+    """Parameters (r,) from a recording that was changed a little after ``like`` was made of it."""
+    x = problem.all_unknowns(like.estimate.nearest)
+    made = problem.equations(recording, problem.coulomb(x))
+    if "gain" in problem.unknowns.kinds:
+        made = without_noise(problem, made, x)
+    used = _used(problem, made)
+    Y, b = problem.columns(made) * used[..., None], problem.torque(made) * used
+    return fit(Y, b, problem.value(problem.nominal), problem.usual).x
+
+
+def without_noise(problem: Problem, made: Equations, x: Array) -> Equations:
+    """The equations with gains' columns from the torque that ``x`` (P,) predicts.
+
+    A column made of the measured torque is as noisy as that: least squares would take it for the cause of everything.
+    """
+    u, joints = problem.unknowns, np.arange(problem.unknowns.n)
+    columns, Y = problem.unknowns.columns("gain"), made.Y.copy()
+    Y[:, joints, columns] = 0.0
+    Y[:, joints, columns] = -(Y @ x) / (1.0 + np.maximum(x[u.columns("gain")], -0.9))
+    return replace(made, Y=Y)
 
 
 def _used(problem: Problem, made: Equations) -> NDArray[np.bool_]:
@@ -192,12 +128,8 @@ def _check_gains(problem: Problem, made: Equations, used: NDArray[np.bool_]) -> 
     Noise hides that, so torques are looked at that have none: those of the nominal arm on the same motion.
     """
     given = np.array([problem.fixed.get(name, 0.0) for name in problem.unknowns.names])
-    free = np.where([name in problem.fixed for name in problem.unknowns.names], given, problem.nominal)
-    columns = problem.unknowns.columns("gain")
-    Y = made.Y.copy()
-    Y[:, np.arange(problem.unknowns.n), columns] = 0.0
-    Y[:, np.arange(problem.unknowns.n), columns] = -(Y @ free)
-    exact = problem.columns(replace(made, Y=Y)) * used[..., None]
+    everything = np.where([name in problem.fixed for name in problem.unknowns.names], given, problem.nominal)
+    exact = problem.columns(without_noise(problem, made, everything)) * used[..., None]
     prior = problem.value(problem.nominal)
     lost = fit(exact, exact @ prior, prior, problem.usual).lost
     names = zip(problem.parameters.names, lost, strict=True)
