@@ -36,13 +36,14 @@ def place_for(path: Path, made: str) -> Path:
 
 def make_absolute(block: dict[str, Any], folder: Path) -> None:
     """Paths that began at the old file's folder begin at the root, for the new file stands elsewhere."""
-    model = (block.get("controller") or {}).get("model")
-    for holder in (block, model if isinstance(model, dict) else {}):
-        if isinstance(holder.get("arm"), str) and holder["arm"] not in ARMS:
+    asked = block.get("identify") or {}
+    models = [(law or {}).get("model") for law in (block.get("controller"), asked.get("control"))]
+    for holder in (block, *models, asked.get("nominal")):
+        if isinstance(holder, dict) and isinstance(holder.get("arm"), str) and holder["arm"] not in ARMS:
             holder["arm"] = str((folder / holder["arm"]).resolve())
-    trajectory = block.get("trajectory")
-    if isinstance(trajectory, dict) and isinstance(trajectory.get("file"), str):
-        trajectory["file"] = str((folder / trajectory["file"]).resolve())
+    for motion in (block.get("trajectory"), asked.get("validation")):
+        if isinstance(motion, dict) and isinstance(motion.get("file"), str):
+            motion["file"] = str((folder / motion["file"]).resolve())
 
 
 def write_scenario(path: Path, remarks: Sequence[str], document: Mapping[str, Any]) -> None:
