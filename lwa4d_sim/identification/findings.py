@@ -30,6 +30,7 @@ from lwa4d_sim.recordings.recording import Recording
 from lwa4d_sim.scenario import Scenario
 
 STEPS = 4  # of an identification that `identify` announces, beside its repeats
+OTHER_DRAW = 2**63 - 1  # number of the noise on the second motion, out of the way of all repeats
 AGAIN = 8  # assumed: draws of noise behind the mean that tells a bias
 
 
@@ -92,7 +93,7 @@ class Findings:
 
 def bias(problem: Problem, recording: Recording, found: Fit) -> dict[str, Array]:
     """How far the estimate (r,) moves when something that a bus does to the data is not allowed for."""
-    x, made = found.estimate.x, dict[str, Array]()
+    x, made = refitted(problem, recording, found), dict[str, Array]()
     period = recording.period
     lags = recording.since - recording.t
     if (lags > 1e-9).any():
@@ -176,7 +177,7 @@ def identify(
         second = (
             None
             if options.validation is None
-            else noisy(experiment.simulated(options.validation), options.noise, -1 % 2**63)
+            else noisy(experiment.simulated(options.validation), options.noise, OTHER_DRAW)
         )
     else:
         first, second = data

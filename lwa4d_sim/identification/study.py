@@ -16,9 +16,9 @@ from lwa4d_sim.mjcf import torque_limits
 from lwa4d_sim.recordings.recording import Recording
 
 FEWEST_SLIDING = 0.2  # assumed: share of a joint's rows below which those in which it turns or sticks are used as well
-GAIN_PASSES, SETTLED = 20, 1e-6  # likewise where drive gains are fitted, which are not linear (three are usual)
 SURE = 1e3  # assumed: how much better than by all data together a known unknown of a link is known
 PASSES = 2  # of the fit: the first says how slowly a joint may slide
+GAIN_PASSES, SETTLED = 20, 1e-6  # likewise where drive gains are fitted, which are not linear (three are usual)
 # How far a joint's parameter usually is from its nominal value, as a share of the peak torque: assumed from the wrist's
 # friction and rotors, which are 0.01 to 0.25 of it (`lwa4d_sim.arm.WRIST`).
 USUAL = {"viscous": 0.25, "coulomb": 0.1, "offset": 0.02, "armature": 0.01}
@@ -33,7 +33,6 @@ class Fit:
         equations: of the recording.
         used: rows (W, n) that were fitted.
         estimate: of the parameters.
-        std_error: (r,).
         torque_noise: standard deviation of each torque sample (n,) [N m], as the residuals have it.
         influence: of the samples' noise on the estimate.
         covariance: of the estimate (r, r).
