@@ -18,7 +18,7 @@ from lwa4d_sim.identification.findings import bias, covered, validate
 from lwa4d_sim.identification.inertia import pseudo_inertia, standard_parameters
 from lwa4d_sim.identification.options import MeasurementNoise
 from lwa4d_sim.identification.regressor import Regressor
-from lwa4d_sim.identification.study import fit_recording, possible
+from lwa4d_sim.identification.study import fit_recording, possible, refitted
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.mjcf import chain_of, load_model
 
@@ -300,6 +300,22 @@ def test_noisy_torques_do_not_bias_any_method(method: str) -> None:
         z.append((found.estimate.x - truth) / found.std_error)
     assert np.abs(np.mean(z, axis=0)).max() < 4.0 / np.sqrt(40)
     assert np.mean(np.abs(z) < INTERVAL) == pytest.approx(0.95, abs=0.05)
+
+
+def test_noise_of_positions_spreads_as_its_influence_says() -> None:
+    """The standard errors worked out from matrices against the scatter of 300 fits; friction carries noise, too."""
+    text = SHORT.replace("{parameters: thesis, joints: []}", "{joints: [viscous, armature]}")
+    text = text.replace("controller:", "plant: {friction: {viscous: 20.0}, armature: 0.5}\ncontroller:")
+    experiment = Experiment.of(Scenario.parse(text), None)
+    problem, clean = experiment.problem, experiment.simulated()
+    found = fit_recording(problem, noisy(clean, MeasurementNoise(position=1e-4)))  # its weights are those of such noise
+    sigma = np.full(2, 1e-4)
+    draws = [
+        refitted(problem, noisy(clean, MeasurementNoise(position=1e-4), repeat), found) for repeat in range(1, 301)
+    ]
+    scatter = np.std(draws, axis=0)
+    stated = np.sqrt(np.diag(found.influence.covariance(sigma, np.zeros(2))))
+    np.testing.assert_allclose(scatter, stated, rtol=0.15)  # the scatter of 300 is known to 4 %
 
 
 def test_noisy_torques_do_not_draw_gains_to_nothing() -> None:
