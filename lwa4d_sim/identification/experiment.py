@@ -10,7 +10,7 @@ import numpy as np
 from lwa4d_sim.controllers import ControllerParameters
 from lwa4d_sim.controllers.belief import Belief, believed_model
 from lwa4d_sim.errors import IdentificationError, ModelError, ScenarioError
-from lwa4d_sim.identification.model_file import write_model
+from lwa4d_sim.identification.model_file import write_unknowns
 from lwa4d_sim.identification.options import Identify, MeasurementNoise
 from lwa4d_sim.identification.problem import Problem
 from lwa4d_sim.interfaces import Array
@@ -60,6 +60,8 @@ class Experiment:
         # how the arm stands is known, whatever a controller is told of it
         belief = replace(options.nominal or believed, gravity=settings.plant.gravity)
         try:
+            if options.nominal is not None and options.nominal.gravity not in (None, belief.gravity):
+                raise IdentificationError("is that of the plant; set plant.gravity", "identify.nominal.gravity")
             problem = Problem.of(options, believed_model(belief, settings.arm, scenario.folder))
             for what in ("position", "torque"):
                 given = getattr(options.noise, what)
@@ -110,16 +112,9 @@ class Experiment:
         Raises:
             ModelError: it cannot be written.
         """
-        u = self.problem.unknowns
-        write_model(
-            model_path(self.belief.arm or self.settings.arm, self.scenario.folder),
-            destination,
-            pi=identified[: 10 * u.n].reshape(u.n, 10),
-            armature=identified[u.columns("armature")],
-            viscous=identified[u.columns("viscous")],
-            coulomb=identified[u.columns("coulomb")],
-            about=f"identified from {self.scenario.name}, variant {self.variant}",
-        )
+        source = model_path(self.belief.arm or self.settings.arm, self.scenario.folder)
+        about = f"identified from {self.scenario.name}, variant {self.variant}"
+        write_unknowns(self.problem.unknowns, identified, source, destination, about)
 
     def tried(self, control: ControllerParameters, model: Path) -> dict[str, dict[str, Any]]:
         """Metrics of a control law on the second motion, with the nominal and with the identified model.

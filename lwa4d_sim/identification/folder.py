@@ -14,7 +14,7 @@ from lwa4d_sim.assembly import versions
 from lwa4d_sim.folders import claim, written_whole
 from lwa4d_sim.identification.findings import Findings
 from lwa4d_sim.identification.grades import LOST, grades
-from lwa4d_sim.identification.model_file import write_model
+from lwa4d_sim.identification.model_file import write_unknowns
 from lwa4d_sim.identification.report import command, write_identification_page
 from lwa4d_sim.identification.words import details, headline, interval, meaning, sound
 from lwa4d_sim.recordings.recording import Recording
@@ -53,7 +53,9 @@ def write_findings(folder: Path, found: Findings, model: Path, *, plots: bool = 
         text = json.dumps(record(found, data), indent=1, allow_nan=False)
         (partial / "identification.json").write_text(text + "\n", encoding="utf-8")
         (partial / "parameters.yaml").write_text(parameters_text(found), encoding="utf-8")
-        _write_model(partial / "identified.xml", found, model)
+        about = f"identified from {found.scenario.name}, variant {found.variant}; see parameters.yaml beside this file"
+        # written anew from the first, so that paths of meshes begin at the new place
+        write_unknowns(found.problem.unknowns, found.identified, model, partial / "identified.xml", about)
         _write_torque(partial / "torque.csv", found)
         if plots:
             from lwa4d_sim.identification.parameter_plots import draw_parameters
@@ -66,12 +68,13 @@ def write_findings(folder: Path, found: Findings, model: Path, *, plots: bool = 
 
 def as_object(found: Findings) -> dict[str, Any]:
     """What a program wants to know; what does not exist is None."""
+    parameters = _parameters(found)
     return {
         "name": found.scenario.name,
         "variant": found.variant,
         "verdict": headline(found),
         "sound": sound(found),
-        "parameters": _parameters(found),
+        "parameters": parameters,
         "validation": {
             "nrmse": _plain(found.validation.nrmse["estimate"]),
             "model": _plain(found.validation.nrmse["identified"]),
@@ -82,7 +85,7 @@ def as_object(found: Findings) -> dict[str, Any]:
         "repeats": found.repeats,
         "tried": _plain(found.tried),
         "refined": None if found.refined is None else _plain(asdict(found.refined)),
-        "lost": [name for name, row in _parameters(found).items() if row["estimate"] is None],
+        "lost": [name for name, row in parameters.items() if row["estimate"] is None],
         "remarks": list(found.remarks),
     }
 
@@ -175,19 +178,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def _write_model(path: Path, found: Findings, model: Path) -> None:
-    u, values = found.problem.unknowns, found.identified
-    write_model(
-        model,
-        path,
-        pi=values[: 10 * u.n].reshape(u.n, 10),
-        armature=values[u.columns("armature")],
-        viscous=values[u.columns("viscous")],
-        coulomb=values[u.columns("coulomb")],
-        about=f"identified from {found.scenario.name}, variant {found.variant}; see parameters.yaml beside this file",
-    )
 
 
 def _write_torque(path: Path, found: Findings) -> None:

@@ -7,13 +7,10 @@ import numpy as np
 from lwa4d_sim.identification.estimate import INTERVAL
 from lwa4d_sim.identification.findings import Findings
 from lwa4d_sim.identification.problem import Problem
-from lwa4d_sim.identification.study import USUAL, USUAL_GAIN
 from lwa4d_sim.interfaces import Array
-from lwa4d_sim.mjcf import torque_limits
 
 WELL, WEAK, LOST = "well", "weakly", "not"  # told, by the data
 NOTHING = 30.0  # assumed: sizes that half an interval may be wide before the number in its middle says nothing at all
-UNLIMITED = 100.0  # [N m] assumed where the model states no peak torque, as in `study.possible`
 
 
 @dataclass(frozen=True)
@@ -54,15 +51,12 @@ def sizes(problem: Problem) -> Array:
 
     A link whose pseudo-inertia is [[S, h], [h^T, m]] has |h_i| <= sqrt(m tr S), I_ii <= tr S and |I_ij| <= tr S / 2,
     because S_ii and its minors are positive (derived from Wensing, Kim, Slotine 2018); tr S = tr I / 2 is taken from
-    the nominal arm. A joint's own are what a drive of its peak torque usually has (`study.USUAL`).
+    the nominal arm. A joint's own are what a drive of its peak torque usually has (`problem.USUAL`).
     """
     u, parameters = problem.unknowns, problem.parameters
     pi = problem.nominal[: 10 * u.n].reshape(u.n, 10)
     m, second = pi[:, 0], pi[:, [4, 6, 9]].sum(axis=1) / 2.0
     link = np.stack([m, *[np.sqrt(m * second)] * 3, *(second * f for f in (1.0, 0.5, 1.0, 0.5, 0.5, 1.0))], axis=1)
-    peak = torque_limits(problem.model)
-    peak = np.where(np.isfinite(peak), peak, UNLIMITED)
-    own = [peak * USUAL[kind] if kind in USUAL else np.full(u.n, USUAL_GAIN) for kind in u.kinds]
-    usual = dict(zip(u.names, np.concatenate([link.ravel(), *own]), strict=True))
+    usual = dict(zip(u.names, np.concatenate([link.ravel(), problem.usual_joints]), strict=True))
     leading = np.array([usual.get(name, 0.0) for name in parameters.names])
     return np.asarray(np.maximum(np.abs(problem.value(problem.nominal)), leading))

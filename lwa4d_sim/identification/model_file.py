@@ -18,6 +18,7 @@ import numpy as np
 from lwa4d_sim.errors import IdentificationError, ModelError, RecordError
 from lwa4d_sim.identification.consistent import margin
 from lwa4d_sim.identification.inertia import NAMES, inertia_matrix, standard_parameters
+from lwa4d_sim.identification.parameters import Unknowns
 from lwa4d_sim.interfaces import Array
 from lwa4d_sim.mjcf import chain_of, home, load_model, torque_limits
 from lwa4d_sim.rotations import rotation_vector
@@ -87,6 +88,23 @@ def write_model(
     finally:
         with suppress(OSError):
             partial.unlink()
+
+
+def write_unknowns(unknowns: Unknowns, values: Array, source: Path, destination: Path, about: str) -> None:
+    """Write the arm with these values (P,) of its unknowns; offsets and gains have no place in an MJCF.
+
+    Raises:
+        ModelError: it cannot be written, see `write_model`.
+    """
+    write_model(
+        source,
+        destination,
+        pi=values[: 10 * unknowns.n].reshape(unknowns.n, 10),
+        armature=values[unknowns.columns("armature")],
+        viscous=values[unknowns.columns("viscous")],
+        coulomb=values[unknowns.columns("coulomb")],
+        about=about,
+    )
 
 
 def _check(pi: Array, joints: dict[str, Array], n: int) -> None:

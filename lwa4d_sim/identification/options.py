@@ -44,7 +44,7 @@ class Identify:
         method: weighted by each joint's residual; ordinary (thesis, eq. 4.29); total for noisy regressors.
         noise: of the measurements.
         nominal: the arm as it is known before; what the data do not tell is taken from it. Default: what the
-            controller believes.
+            controller believes. Its gravity is the plant's.
         validation: a second motion, which the estimate has not seen.
         control: a controller that is tried on the second motion, with the nominal and with the identified model.
         table: what the numbers of a measured table mean.

@@ -13,9 +13,15 @@ from lwa4d_sim.identification.options import Identify
 from lwa4d_sim.identification.parameters import KINDS, Unknowns, unknowns_of
 from lwa4d_sim.identification.sets import ParameterSet, base_set, thesis_set, usual_columns
 from lwa4d_sim.interfaces import Array
+from lwa4d_sim.mjcf import torque_limits
 from lwa4d_sim.recordings.recording import Recording
 
 POSITIVE = ("m", "Ixx", "Iyy", "Izz")
+# How far a joint's parameter usually is from its nominal value, as a share of the peak torque: assumed from the wrist's
+# friction and rotors, which are 0.01 to 0.25 of it (`lwa4d_sim.arm.WRIST`).
+USUAL = {"viscous": 0.25, "coulomb": 0.1, "offset": 0.02, "armature": 0.01}
+USUAL_GAIN = 0.1  # assumed
+UNLIMITED = 100.0  # [N m] assumed where the model states no peak torque
 
 
 @dataclass(frozen=True)
@@ -80,6 +86,16 @@ class Problem:
             parameters = base_set(unknowns, names)
         usual = usual_columns(parameters, unknowns)
         return Problem(options, model, unknowns, nominal, fixed, parameters, usual, friction_of(model))
+
+    @property
+    def usual_joints(self) -> Array:
+        """How far the joints' unknowns (P - 10 n,) usually are from their nominal values, each in its own unit."""
+        peak = torque_limits(self.model)
+        peak = np.where(np.isfinite(peak), peak, UNLIMITED)
+        n = self.unknowns.n
+        return np.concatenate(
+            [peak * USUAL[kind] if kind in USUAL else np.full(n, USUAL_GAIN) for kind in self.unknowns.kinds]
+        )
 
     def equations(self, recording: Recording, coulomb: Array) -> Equations:
         """Of a recording, given about the size of Coulomb friction (n,) [N m]."""

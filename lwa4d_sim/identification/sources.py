@@ -17,10 +17,16 @@ TABLES, RECORDS, SHEETS = (".csv", ".parquet"), (".h5", ".hdf5"), (".eds", ".dcf
 
 
 def read_data(path: Path, experiment: Experiment, sheets: Sequence[Path]) -> Recording:
-    """Read a file of measured data; arguments and errors as `_read`.
+    """Read a file of measured data.
+
+    Args:
+        path: of the file.
+        experiment: whose arm and options say how it is to be read.
+        sheets: data sheets of the drives in a CAN log, or folders of them.
 
     Raises:
-        IdentificationError: torques are far beyond what the joints can have.
+        IdentificationError: it cannot be read, does not hold what is needed, or has torques far beyond the motors'.
+        RecordError: it is no run record.
     """
     recording = _read(path, experiment, sheets)
     for name, (_, _, peak), tau in zip(
@@ -36,17 +42,7 @@ def read_data(path: Path, experiment: Experiment, sheets: Sequence[Path]) -> Rec
 
 
 def _read(path: Path, experiment: Experiment, sheets: Sequence[Path]) -> Recording:
-    """Read a file of measured data.
-
-    Args:
-        path: of the file.
-        experiment: whose arm and options say how it is to be read.
-        sheets: data sheets of the drives in a CAN log, or folders of them.
-
-    Raises:
-        IdentificationError: it cannot be read, or does not hold what is needed.
-        RecordError: it is no run record.
-    """
+    """What the file holds, whatever it says."""
     facts = joint_facts(experiment.problem.model)
     ending = path.suffix.lower()
     if sheets and ending in (*TABLES, *RECORDS):

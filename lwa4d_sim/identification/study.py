@@ -12,17 +12,12 @@ from lwa4d_sim.identification.estimate import INTERVAL, Estimate, fit, recursive
 from lwa4d_sim.identification.noise import Influence, influence
 from lwa4d_sim.identification.problem import Problem
 from lwa4d_sim.interfaces import Array
-from lwa4d_sim.mjcf import torque_limits
 from lwa4d_sim.recordings.recording import Recording
 
 FEWEST_SLIDING = 0.2  # assumed: share of a joint's rows below which those in which it turns or sticks are used as well
 SURE = 1e3  # assumed: how much better than by all data together a known unknown of a link is known
 PASSES = 2  # of the fit: the first says how slowly a joint may slide
 GAIN_PASSES, SETTLED = 20, 1e-6  # likewise where drive gains are fitted, which are not linear (three are usual)
-# How far a joint's parameter usually is from its nominal value, as a share of the peak torque: assumed from the wrist's
-# friction and rotors, which are 0.01 to 0.25 of it (`lwa4d_sim.arm.WRIST`).
-USUAL = {"viscous": 0.25, "coulomb": 0.1, "offset": 0.02, "armature": 0.01}
-USUAL_GAIN = 0.1  # assumed
 
 
 @dataclass(frozen=True)
@@ -156,6 +151,8 @@ def regressor_noise(
     for _ in range(draws):
         moved = replace(recording, q=recording.q + step * rng.normal(size=recording.q.shape))
         there = problem.equations(moved, coulomb)
+        if "gain" in problem.unknowns.kinds:  # their columns are predictions, and have no noise of the samples
+            there.Y[..., problem.unknowns.columns("gain")] = made.Y[..., problem.unknowns.columns("gain")]
         E = np.concatenate([problem.columns(there) - problem.columns(made), (there.b - made.b)[..., None]], axis=-1)
         E = (E * root * used[..., None]).reshape(-1, len(total))
         total += E.T @ E / draws
@@ -178,14 +175,11 @@ def possible(problem: Problem, found: Fit) -> Array:
     sure = SURE * max(float(np.linalg.norm(rows[:, :-1], axis=0).max()), 1.0)
     pins = sure * np.concatenate([np.eye(len(free))[known], given[known, None]], axis=1)
     R = np.asarray(np.linalg.qr(np.concatenate([rows, pins]), mode="r"))
-    peak = torque_limits(problem.model)
-    peak = np.where(np.isfinite(peak), peak, np.nanmax(np.where(np.isfinite(peak), peak, np.nan), initial=100.0))
-    usual = np.concatenate([peak * USUAL[kind] if kind in USUAL else np.full(u.n, USUAL_GAIN) for kind in u.kinds])
     signed = np.concatenate([np.full(u.n, kind in ("offset", "gain")) for kind in u.kinds])
     joint = slice(10 * u.n, None)
     lower = np.where(free[joint], np.where(signed, -np.inf, 0.0), prior[joint])
     upper = np.where(free[joint], np.inf, prior[joint])
-    return consistent(R[:, :-1], R[:, -1], prior, n_links=u.n, spread=np.maximum(usual, 1e-6), lower=lower, upper=upper)
+    return consistent(R[:, :-1], R[:, -1], prior, n_links=u.n, spread=problem.usual_joints, lower=lower, upper=upper)
 
 
 def nrmse(problem: Problem, made: Equations, torque: Array) -> Array:
