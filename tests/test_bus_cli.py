@@ -3,7 +3,6 @@
 import json
 import random
 import re
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -14,8 +13,8 @@ import can
 import canopen
 import pytest
 import yaml
+from cli_rig import Call, Result, caller
 
-from lwa4d_sim import cli
 from lwa4d_sim.assembly import build_blocks
 from lwa4d_sim.bus.arm import BusArm
 from lwa4d_sim.bus.build import plan_for, served_arm
@@ -40,29 +39,12 @@ SMALL: dict[str, Any] = {
 }
 
 
-class Result(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-
-Call = Callable[..., Result]
-
-
 @pytest.fixture
 def call(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Call:
     """Runs `lwa4d-sim bus` in a new folder that holds small.yaml."""
     monkeypatch.chdir(tmp_path)
     Path("small.yaml").write_text(yaml.safe_dump(SMALL))
-
-    def run(*arguments: str | Path) -> Result:
-        capfd.readouterr()
-        monkeypatch.setattr(sys, "argv", ["lwa4d-sim", "bus", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        return Result(int(str(end.value.code)), *capfd.readouterr())
-
-    return run
+    return caller(capfd, monkeypatch, "bus")
 
 
 def refused(result: Result, words: str) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from planar_rig import THESIS_MOTION
 
 from lwa4d_sim import Scenario, run
 from lwa4d_sim.arm import ARMS
@@ -211,20 +212,18 @@ def test_bump_has_integral_one_and_half_the_power_at_the_bandwidth() -> None:
 
 def planar(loop: str, seconds: float = 8.0, plant: str = "{}") -> Any:
     """A short run of the planar arm."""
-    text = f"""
+    text = (
+        f"""
 name: short
-arm: lwa4d_planar
 plant: {plant}
-initial: {{q: [0.0, -1.5707963]}}
-trajectory:
-  kind: fourier
-  a: [[0.156, -0.478, 0.078, -0.388, -0.070], [0.064, -0.335, 0.451, 0.292, 1.046]]
-  b: [[0.088, 0.253, -0.207, 0.549, 0.150], [-0.125, 0.292, -0.369, 0.557, 0.964]]
-  duration: {seconds}
+"""
+        + THESIS_MOTION
+        + f"""  duration: {seconds}
   lead_in: 1.0
 controller: {{kind: pd_gravity, space: joint, kp: [30.0, 5.0], kd: [4.0, 0.5]}}
 loop: {loop}
 """
+    )
     return run(Scenario.parse(text))
 
 

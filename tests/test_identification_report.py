@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from planar_rig import THESIS_MOTION
 from scipy.stats import chi2
 
 from lwa4d_sim import Scenario
@@ -37,16 +38,13 @@ from lwa4d_sim.page import NONE
 from lwa4d_sim.recordings.recording import Recording
 from lwa4d_sim.yaml_text import parse
 
-TEXT = """
+TEXT = (
+    """
 # <script>alert("not me")</script>
 name: small
-arm: lwa4d_planar
-initial: {q: [0.0, -1.5707963]}
-trajectory:
-  kind: fourier
-  a: [[0.156, -0.478, 0.078, -0.388, -0.070], [0.064, -0.335, 0.451, 0.292, 1.046]]
-  b: [[0.088, 0.253, -0.207, 0.549, 0.150], [-0.125, 0.292, -0.369, 0.557, 0.964]]
-  duration: 4.0
+"""
+    + THESIS_MOTION
+    + """  duration: 4.0
 controller: {kind: pd_gravity, space: joint, kp: 30.0, kd: 5.0, model: {gravity: [0.0, 0.0, 0.0]}}
 loop: {kind: ideal}
 identify:
@@ -54,6 +52,7 @@ identify:
   joints: []
   nominal: {mass_scale: 1.2}
 """
+)
 TRIED = """  noise: {torque: 0.05, position: 1.0e-5, seed: 3}
   control: {kind: computed_torque, space: joint, p: 10.0}
   validation:

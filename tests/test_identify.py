@@ -2,16 +2,16 @@
 
 import json
 import re
-import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
+from cli_rig import Call, caller
+from planar_rig import THESIS_MOTION
 
-from lwa4d_sim import Scenario, cli, run
+from lwa4d_sim import Scenario, run
 from lwa4d_sim.identification.estimate import INTERVAL
 from lwa4d_sim.identification.experiment import Experiment, noisy
 from lwa4d_sim.identification.findings import bias, covered, validate
@@ -25,29 +25,12 @@ from lwa4d_sim.mjcf import chain_of, load_model
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
 
 
-class Result(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-
-Call = Callable[..., Result]
-
-
 @pytest.fixture
 def call(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Call:
     """Runs `lwa4d-sim identify` in a new folder that holds short.yaml."""
     monkeypatch.chdir(tmp_path)
     Path("short.yaml").write_text(SHORT)
-
-    def run(*arguments: str) -> Result:
-        capfd.readouterr()
-        monkeypatch.setattr(sys, "argv", ["lwa4d-sim", "identify", *arguments])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        return Result(int(str(end.value.code)), *capfd.readouterr())
-
-    return run
+    return caller(capfd, monkeypatch, "identify")
 
 
 def answer(call: Call, *arguments: str) -> Any:
@@ -56,20 +39,18 @@ def answer(call: Call, *arguments: str) -> Any:
     return json.loads(done.out)
 
 
-SHORT = """
+SHORT = (
+    """
 name: short
-arm: lwa4d_planar
-initial: {q: [0.0, -1.5707963]}
-trajectory:
-  kind: fourier
-  a: [[0.156, -0.478, 0.078, -0.388, -0.070], [0.064, -0.335, 0.451, 0.292, 1.046]]
-  b: [[0.088, 0.253, -0.207, 0.549, 0.150], [-0.125, 0.292, -0.369, 0.557, 0.964]]
-  duration: 7.0
+"""
+    + THESIS_MOTION
+    + """  duration: 7.0
   lead_in: 1.0
 controller: {kind: pd_gravity, space: joint, kp: [30.0, 5.0], kd: [4.0, 0.5]}
 loop: {kind: sampled, period: 0.01}
 identify: {parameters: thesis, joints: []}
 """
+)
 
 
 REAL = {"p1": 0.56644, "p2": 0.16151, "p3": 0.26043, "p4": 20.5931, "p5": 7.78914}  # thesis, Table 5.4

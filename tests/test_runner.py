@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from planar_rig import THESIS_MOTION
 
 from lwa4d_sim.arm import load_arm
 from lwa4d_sim.errors import KinematicsError, LwaError, ModelError, ScenarioError, TrajectoryError
@@ -136,18 +137,16 @@ def test_members_that_cannot_be_stepped_together(overrides: dict[str, object], s
 
 def test_identification_motion_runs_on_the_planar_arm() -> None:
     """The thesis's excitation (section 5.1.3) under its PD gains, from a start off the reference."""
-    text = """
+    text = (
+        """
 name: excitation
-arm: lwa4d_planar
-initial: {q: [0.0, -1.5707963]}
-trajectory:
-  kind: fourier
-  a: [[0.156, -0.478, 0.078, -0.388, -0.070], [0.064, -0.335, 0.451, 0.292, 1.046]]
-  b: [[0.088, 0.253, -0.207, 0.549, 0.150], [-0.125, 0.292, -0.369, 0.557, 0.964]]
-  duration: 4.0
+"""
+        + THESIS_MOTION
+        + """  duration: 4.0
 controller: {kind: pd_gravity, kp: 30, kd: 5}
 loop: {kind: ideal}
 """
+    )
     log = run(Scenario.parse(text))
     assert log.metrics()["stable"]
     assert log.q.shape == (4001, 2)

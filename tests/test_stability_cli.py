@@ -4,18 +4,16 @@ import csv
 import json
 import re
 import shlex
-import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from cli_rig import Call, Result, caller
 from PIL import Image
 
-from lwa4d_sim import cli
 from lwa4d_sim.errors import RecordError
 from lwa4d_sim.scenario import Scenario
 from lwa4d_sim.stability import folder, guides
@@ -39,29 +37,12 @@ SMALL: dict[str, Any] = {
 PICTURES = {"latency", "period", "workspace", "eigenvalues", "modes", "motion"}
 
 
-class Result(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-
-Call = Callable[..., Result]
-
-
 @pytest.fixture
 def call(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Call:
     """Runs `lwa4d-sim stability` in a new folder that holds small.yaml."""
     monkeypatch.chdir(tmp_path)
     Path("small.yaml").write_text(yaml.safe_dump(SMALL))
-
-    def run(*arguments: str) -> Result:
-        capfd.readouterr()
-        monkeypatch.setattr(sys, "argv", ["lwa4d-sim", "stability", *arguments])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        return Result(int(str(end.value.code)), *capfd.readouterr())
-
-    return run
+    return caller(capfd, monkeypatch, "stability")
 
 
 def refused(result: Result, words: str) -> None:
